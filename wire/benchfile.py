@@ -1,0 +1,71 @@
+"""Reading TOML files into pydantic models with errors that name file, key and what is allowed."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from softloop.wire.errors import BadConfig, BadFile
+
+
+class Table(BaseModel):
+    """Base of every table of a bench or parameter file: unknown keys are errors, values do not change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+T = TypeVar("T", bound=BaseModel)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The content of a TOML file. Raises BadFile with one line that says what is wrong and where."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadFile(f"{path}: cannot be read: {error.strerror or error}") from None
+    except UnicodeDecodeError as error:
+        raise BadFile(f"{path}: not UTF-8 text (byte {error.start})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise BadFile(f"{path}: not valid TOML: {error}") from None
+
+
+def load_model(model: type[T], content: dict[str, Any], path: Path | str) -> T:
+    """Validate `content` as `model`. Raises BadConfig: one line with file, key, fault and the allowed values."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise BadConfig(f"{path}: {'; '.join(_say(model, e) for e in error.errors()[:3])}") from None
+
+
+def _say(model: type[BaseModel], error: Any) -> str:
+    where = [str(p) for p in error["loc"]]
+    name = ".".join(where) or "(file)"
+    if error["type"] == "extra_forbidden":
+        return f"unknown key '{name}'; allowed here: {', '.join(_allowed(model, where[:-1]))}"
+    if error["type"] == "missing":
+        return f"key '{name}' is missing"
+    shown = repr(error.get("input"))
+    shown = shown if len(shown) <= 60 else shown[:57] + "..."
+    return f"key '{name}': {error['msg'].removeprefix('Value error, ')} (got {shown})"
+
+
+def _allowed(model: type[BaseModel], where: list[str]) -> list[str]:
+    current: Any = model
+    for part in where:
+        field = current.model_fields.get(part) if isinstance(current, type) and issubclass(current, BaseModel) else None
+        current = _model_in(field.annotation) if field else _model_in(current)
+    return sorted(current.model_fields) if isinstance(current, type) and issubclass(current, BaseModel) else ["(nothing)"]
+
+
+def _model_in(annotation: Any) -> Any:
+    """The pydantic model inside an annotation such as `X | None`, `list[X]` or `dict[str, X]`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for inner in getattr(annotation, "__args__", ()):
+        found = _model_in(inner)
+        if found is not None:
+            return found
+    return None

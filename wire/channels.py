@@ -1,0 +1,68 @@
+"""The one table of channels: key, message, rate, staleness budget, delivery, logged or not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+MS = 1_000_000
+
+ROOT = "softloop"
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One channel of a bench.
+
+    Attributes:
+        name: last part of its key, `softloop/<bench>/<name>`.
+        message: name of its `.msg` definition.
+        rate_hz: how often it is published when all is well; 0 for "when something happens".
+        staleness_ns: how old its newest sample may be before an input that needs it counts as lost; 0 for never.
+        realtime: on the 5 ms path: sent with the highest priority, never waited for at wall pace.
+        logged: the recorder keeps it.
+    """
+
+    name: str
+    message: str
+    rate_hz: float
+    staleness_ns: int = 0
+    realtime: bool = False
+    logged: bool = True
+
+
+PRESSURE = Channel("pressure", "PressureSample", 200.0, 20 * MS, realtime=True)
+INCLINATION = Channel("inclination", "InclinationSample", 200.0, 30 * MS, realtime=True)
+COMMAND = Channel("command", "ValveCommand", 200.0, 15 * MS, realtime=True)
+VALVES = Channel("valves", "ValveStatus", 200.0, 50 * MS, realtime=True)
+REQUEST = Channel("request", "GateRequest", 0.0)
+EVENT = Channel("event", "Event", 0.0)
+CYCLE = Channel("cycle", "CycleRecord", 200.0)
+TRUTH = Channel("truth", "PlantTruth", 200.0)
+STATUS = Channel("status", "ProcessStatus", 1.0)
+CAN = Channel("can", "CanFrame", 600.0, realtime=True)  # key: can/<bus>/<arbitration id in hex>
+
+CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, EVENT, CYCLE, TRUTH, STATUS, CAN)
+
+
+def key(bench: str, channel: Channel) -> str:
+    """Zenoh key of a channel of a bench."""
+    return f"{ROOT}/{bench}/{channel.name}"
+
+
+def can_key(bench: str, bus: str, arbitration_id: int) -> str:
+    """Zenoh key of a CAN frame, so that access rules can tell frames apart: `softloop/<bench>/can/<bus>/<id>`."""
+    return f"{ROOT}/{bench}/{CAN.name}/{bus}/{arbitration_id:x}"
+
+
+def alive_key(bench: str, process: str) -> str:
+    """Key of a process's liveliness token."""
+    return f"{ROOT}/{bench}/alive/{process}"
+
+
+def channel_of_key(bench: str, full_key: str) -> Channel | None:
+    """The channel a key belongs to, or None."""
+    head = f"{ROOT}/{bench}/"
+    if not full_key.startswith(head):
+        return None
+    name = full_key[len(head) :].split("/", 1)[0]
+    return next((c for c in CHANNELS if c.name == name), None)

@@ -1,0 +1,36 @@
+"""The errors a person sees: one line each, with an exit code."""
+
+from __future__ import annotations
+
+EXIT_OK = 0
+EXIT_NEGATIVE = 1  # the command ran, and its answer is no (a fault, a difference, a missed check)
+EXIT_USAGE = 2  # a bad argument or a bad file
+EXIT_ENVIRONMENT = 3  # the machine: an address in use, a device or a permission that is missing
+EXIT_LOST = 4  # a process or a wire was lost while running
+EXIT_INTERRUPTED = 130
+
+
+class SoftloopError(Exception):
+    """Base of all errors meant for a person: `str(error)` is the one line to show."""
+
+    exit_code = EXIT_USAGE
+
+
+class BadFile(SoftloopError):
+    """A file that cannot be read as what it should be."""
+
+
+class BadConfig(SoftloopError):
+    """A bench or parameter file with a wrong key or value."""
+
+
+class Unavailable(SoftloopError):
+    """Something of the machine that is not there or in use."""
+
+    exit_code = EXIT_ENVIRONMENT
+
+
+class Lost(SoftloopError):
+    """A process or a wire that went away while running."""
+
+    exit_code = EXIT_LOST

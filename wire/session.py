@@ -1,0 +1,204 @@
+"""Zenoh as softloop uses it: explicit endpoints, no scouting, latest-sample inputs, publishers that never wait."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from softloop.wire.channels import ROOT, Channel, alive_key, key
+from softloop.wire.config import ZenohConfig
+from softloop.wire.errors import Unavailable
+
+UNIX = "unixsock-stream/"
+
+
+def make_config(
+    mode: str, listen: list[str], connect: list[str], lease_ms: int, *, listen_must_work: bool = True
+) -> zenoh.Config:
+    """The one way to a Zenoh configuration: nothing is left to Zenoh's defaults that reaches beyond this machine."""
+    config = zenoh.Config()
+    settings: dict[str, Any] = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "listen/endpoints": listen,
+        "listen/exit_on_failure": listen_must_work,
+        "listen/timeout_ms": 0,
+        "connect/endpoints": connect,
+        "connect/exit_on_failure": False,
+        "connect/timeout_ms": 0 if mode != "client" else -1,
+        # 20 to 100 ms: a router that came back is found again well within the 2 s a rig may be without one.
+        "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
+        "open/return_conditions/connect_scouted": False,
+        "transport/link/tx/lease": lease_ms,
+        # A stalled reader must cost the 5 ms path nothing: what cannot be sent now is dropped.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+        "transport/shared_memory/enabled": False,
+        "timestamping/enabled": False,
+    }
+    for name, value in settings.items():
+        config.insert_json5(name, json.dumps(value))
+    return config
+
+
+def own_endpoint(meeting_point: str, process: str) -> str:
+    """Where a peer listens for direct links: beside the meeting point, on a socket or port of its own."""
+    if meeting_point.startswith(UNIX):
+        folder = Path(meeting_point[len(UNIX) :]).parent
+        return f"{UNIX}{folder}/{Path(meeting_point).stem}.{process}.{os.getpid()}.sock"
+    return meeting_point.rsplit(":", 1)[0] + ":0"
+
+
+def open_session(config: ZenohConfig, bench: str, process: str) -> zenoh.Session:
+    """A session of one process on a bench. Raises Unavailable when it cannot listen."""
+    meet = config.meeting_point(bench)
+    listen = [own_endpoint(meet, process)] if config.mode == "peer" else []
+    return _open(make_config(config.mode, listen, [meet], config.lease_ms), meet)
+
+
+def open_router(config: ZenohConfig, bench: str) -> zenoh.Session:
+    """The meeting point itself. Raises Unavailable when its address is taken."""
+    meet = config.meeting_point(bench)
+    return _open(make_config("router", [meet], [], config.lease_ms), meet)
+
+
+def open_meeting(bench: str, endpoint: str, lease_ms: int = 500) -> zenoh.Session:
+    """A peer for one who comes alone: joins the meeting point, and is it where nobody else is."""
+    name = f"guest-{time.monotonic_ns() & 0xFFFFFF:x}"
+    config = make_config("peer", [endpoint, own_endpoint(endpoint, name)], [endpoint], lease_ms, listen_must_work=False)
+    return _open(config, endpoint)
+
+
+def _open(config: zenoh.Config, where: str) -> zenoh.Session:
+    if where.startswith(UNIX):
+        _check_socket_path(where[len(UNIX) :])
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise Unavailable(f"Zenoh endpoint {where}: {_short(error)}") from None
+
+
+def _check_socket_path(path: str) -> None:
+    # sun_path holds 108 bytes with its final zero; a peer's own socket adds its name and pid.
+    if len(path) > 70:
+        raise Unavailable(f"Zenoh endpoint {UNIX}{path}: a Unix socket's path may have at most 70 characters here")
+    if not Path(path).parent.is_dir():
+        raise Unavailable(f"Zenoh endpoint {UNIX}{path}: there is no folder {Path(path).parent}")
+
+
+def _short(error: Exception) -> str:
+    text = str(error)
+    if any(word in text for word in ("in use", "lock", "Lock", "already")):
+        return "the address is in use; is this bench running already?"
+    return text.split(" at ", maxsplit=1)[0].splitlines()[0][:200]
+
+
+class Latest:
+    """The newest sample of a channel and nothing older: a ring of depth one."""
+
+    def __init__(self, session: zenoh.Session, key_expr: str) -> None:
+        self._subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(1))
+
+    def take(self) -> bytes | None:
+        """The payload of the newest sample that was not taken yet, or None."""
+        sample = self._subscriber.try_recv()
+        return None if sample is None else sample.payload.to_bytes()
+
+
+class Inbox:
+    """All samples of a key expression in order, with a wake-up: for loops that act on arrival.
+
+    Bounded: when nobody takes, the oldest go and are counted in `dropped`.
+    """
+
+    def __init__(self, session: zenoh.Session, key_expr: str, capacity: int = 4096) -> None:
+        self._items: deque[tuple[str, bytes]] = deque(maxlen=capacity)
+        self._ready = threading.Condition()
+        self.dropped = 0
+        handler = zenoh.handlers.Callback(self._receive, indirect=False)
+        self._subscriber = session.declare_subscriber(key_expr, handler)
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        with self._ready:
+            self.dropped += len(self._items) == self._items.maxlen
+            self._items.append((str(sample.key_expr), sample.payload.to_bytes()))
+            self._ready.notify()
+
+    def take(self, timeout_s: float = 0.0) -> tuple[str, bytes] | None:
+        """The oldest (key, payload) waiting, or None after `timeout_s`."""
+        if not self._items and timeout_s > 0:
+            with self._ready:
+                self._ready.wait_for(lambda: bool(self._items), timeout_s)
+        try:
+            return self._items.popleft()
+        except IndexError:
+            return None
+
+    def take_all(self) -> list[tuple[str, bytes]]:
+        """All (key, payload) waiting, oldest first, without waiting."""
+        taken = []
+        while self._items:
+            taken.append(self._items.popleft())
+        return taken
+
+
+class Wire:
+    """One process's end of a bench: publishers, inputs and its sign of life."""
+
+    def __init__(self, session: zenoh.Session, bench: str, process: str) -> None:
+        self.session = session
+        self.bench = bench
+        self.process = process
+        self._token: Any = None
+
+    def publisher(self, channel: Channel) -> Callable[[bytes], None]:
+        """A function that publishes a payload on a channel. It never waits: what cannot be sent is dropped."""
+        publisher = self.declare_publisher(key(self.bench, channel), realtime=channel.realtime)
+        put: Callable[[bytes], None] = publisher.put
+        return put
+
+    def declare_publisher(self, full_key: str, *, realtime: bool) -> zenoh.Publisher:
+        return self.session.declare_publisher(
+            full_key,
+            encoding="application/cdr",
+            priority=zenoh.Priority.REAL_TIME if realtime else zenoh.Priority.DATA,
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=realtime,
+        )
+
+    def latest(self, channel: Channel) -> Latest:
+        """The newest sample of a channel: what a control input is."""
+        return Latest(self.session, key(self.bench, channel))
+
+    def inbox(self, channel: Channel) -> Inbox:
+        """All samples of a channel in order, with a wake-up."""
+        return Inbox(self.session, key(self.bench, channel))
+
+    def everything(self, capacity: int) -> Inbox:
+        """All samples of all channels of the bench."""
+        return Inbox(self.session, f"{ROOT}/{self.bench}/**", capacity)
+
+    def declare_alive(self) -> None:
+        """Show on the network that this process runs, until its session closes."""
+        self._token = self.session.liveliness().declare_token(alive_key(self.bench, self.process))
+
+    def processes_alive(self, timeout_s: float = 0.5) -> set[str]:
+        """Names of the processes of this bench that are alive now."""
+        replies = self.session.liveliness().get(alive_key(self.bench, "*"), timeout=timeout_s)
+        return {str(r.ok.key_expr).rsplit("/", 1)[1] for r in replies if r.ok}
+
+
+@contextmanager
+def open_wire(config: ZenohConfig, bench: str, process: str) -> Iterator[Wire]:
+    """A `Wire` whose session is closed at the end, whatever happened."""
+    with open_session(config, bench, process) as session:
+        yield Wire(session, bench, process)
