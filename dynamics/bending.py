@@ -30,7 +30,7 @@ def bending_acceleration(theta: np.ndarray, angle_deg: float, rate_deg_s: float,
     return bending_drift(theta, angle_deg, rate_deg_s) + theta[8] * pressure_kpa
 
 
-@kernel(types.void(_F8, _F8, array_of(_F8)))
+@kernel(types.void(_F8, _F8, THETA_TYPE))
 def fill_phi_a(angle_deg: float, rate_deg_s: float, phi_a: np.ndarray) -> None:
     """Write phi_a of Eq. 24 into the first eight places of `phi_a`."""
     y, v = angle_deg, rate_deg_s

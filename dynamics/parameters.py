@@ -54,7 +54,7 @@ MODEL = record_dtype(
 )
 VALVE_SHAPE_TYPE = record_type(VALVE_SHAPE)
 MODEL_TYPE = record_type(MODEL)
-THETA_TYPE = array_of(types.f8)
+THETA_TYPE = array_of(types.f8, 1, "A")
 
 
 class Bounded(Table):

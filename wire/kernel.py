@@ -16,7 +16,9 @@ from typing import Any, TypeVar, cast
 import llvmlite.binding as llvm
 import numba
 import numpy as np
-from numba import config, types
+from numba import types
+
+_numba_config: Any = numba.config  # its attributes are made at import; the type checker sees none
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -57,12 +59,12 @@ def kernel(*signatures: Any) -> Callable[[F], F]:
     """
 
     def decorate(function: F) -> F:
-        before = config.CACHE_DIR
-        config.CACHE_DIR = str(CACHE_DIR)
+        before = _numba_config.CACHE_DIR
+        _numba_config.CACHE_DIR = str(CACHE_DIR)
         try:
             compiled = numba.njit(list(signatures), cache=True, nogil=True, error_model="numpy", fastmath=False)(function)
         finally:
-            config.CACHE_DIR = before
+            _numba_config.CACHE_DIR = before
         return cast(F, compiled)
 
     return decorate
@@ -78,9 +80,9 @@ def record_type(dtype: np.dtype[Any]) -> Any:
     return numba.from_dtype(dtype)
 
 
-def array_of(element: Any, dimensions: int = 1) -> Any:
-    """The numba type of a C-ordered array of `element`."""
-    return types.Array(element, dimensions, "C")
+def array_of(element: Any, dimensions: int = 1, layout: str = "C") -> Any:
+    """The numba type of an array of `element`; layout "A" also takes an array that is a field of a record."""
+    return types.Array(element, dimensions, layout)
 
 
 def new_record(dtype: np.dtype[Any]) -> Any:

@@ -1,0 +1,79 @@
+"""`[controller]` of the bench file."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from softloop.wire.benchfile import Table
+
+
+class ActuationConfig(Table):
+    """`[controller.actuation]`: from demanded flow to working mode and currents."""
+
+    modes: Literal["table2", "flow"] = Field("flow", description="the paper's Table 2, or the sign of the demanded flow")
+    flow_hold_kpa_s: float = Field(4.0, ge=0, description="a smaller demand opens no valve")
+    error_hold_deg: float = Field(0.3, ge=0, description="epsilon_0: on a dwell, hold below this error")
+    error_release_deg: float = Field(0.5, ge=0, description="and leave hold above this one")
+    rate_still_deg_s: float = Field(0.5, ge=0, description="a slower reference counts as a dwell")
+    switch_ticks: int = Field(2, ge=1, le=200, description="a mode stays at least this many ticks")
+    bias_fraction: float = Field(0.8, ge=0, le=0.95, description="the closed valve waits at this part of its opening current")
+
+
+class PidConfig(Table):
+    """`[controller.pid]`: C1; pressure in kPa from angle in deg."""
+
+    kp: float = Field(1.0, ge=0)
+    ki: float = Field(4.0, ge=0)
+    kd: float = Field(0.08, ge=0)
+    kv: float = Field(0.24, ge=0, description="velocity feedforward; nominal c0 / b0")
+    ka: float = Field(0.0155, ge=0, description="acceleration feedforward; nominal 1 / b0")
+    integral_max_kpa: float = Field(180.0, gt=0)
+    pressure_gain: float = Field(20.0, gt=0, description="1/s, pressure error to flow")
+    desired_max_kpa: float = Field(150.0, gt=0)
+
+
+class ArcConfig(Table):
+    """`[controller.arc]`: C3, Eqs. 33 to 48."""
+
+    k_s: float = Field(6.0, gt=0, description="K_S1, 1/s")
+    k1: float = Field(8.0, gt=0, description="K_1, 1/s")
+    k2: float = Field(25.0, gt=0, description="K_2, 1/s")
+    rho: float = Field(10.0, gt=0, description="weight of S2 in V2; 1 is the paper's text")
+    epsilon1: float = Field(1.0e5, gt=0, description="(deg/s)^2/s, Eq. 38")
+    epsilon2: float = Field(1.0e4, gt=0, description="kPa^2/s, Eq. 47")
+    delta1: float = Field(100.0, ge=0, description="bound of Delta_1, deg/s2")
+    delta2: float = Field(60.0, ge=0, description="bound of Delta_2, kPa/s")
+    gamma: float = Field(1.0e-5, ge=0, description="adaptation gain of the mechanics, times theta_M^2")
+    gamma_valve: float = Field(1.0e-5, ge=0, description="adaptation gain of valves and leak, times theta_M^2")
+    rate_limit: float = Field(0.5, gt=0, description="an estimate moves at most this part of its range in 1 s")
+    desired_max_kpa: float = Field(150.0, gt=0)
+
+
+class PressureConfig(Table):
+    """`[controller.pressure]`: step 2 alone."""
+
+    k2: float = Field(30.0, gt=0)
+    epsilon2: float = Field(1.0e3, gt=0)
+    delta2: float = Field(60.0, ge=0)
+
+
+class ControllerConfig(Table):
+    """`[controller]`."""
+
+    law: Literal["pid", "arc", "pressure"] = "arc"
+    parameters: str = Field("table1", description="a shipped parameter set, or the path of a parameter file")
+    trajectory: str = Field("t1", description="t1, t2, excitation_1hz, excitation_05hz, or the path of a CSV file t_s, value")
+    trajectory_seed: int = Field(1, ge=0, le=2**32 - 1, description="phases of the multi-sines")
+    approach_s: float = Field(4.0, gt=0, le=60, description="length of the smooth move to the first point")
+    predict: bool = Field(True, description="carry the measured state on to the time at which the command acts")
+    actuation_delay_ms: float = Field(3.0, ge=0, le=100, description="declared, from tick to valve opening")
+    pressure_delay_ms: float = Field(1.5, ge=0, le=100, description="declared lag of the pressure sensor before its stamp")
+    inclination_delay_ms: float = Field(1.0, ge=0, le=100, description="declared lag of the inclinometer before its stamp")
+    pressure_budget_ms: float = Field(20.0, gt=0, description="an older pressure is not valid")
+    inclination_budget_ms: float = Field(30.0, gt=0, description="an older inclination is not valid")
+    actuation: ActuationConfig = ActuationConfig()
+    pid: PidConfig = PidConfig()
+    arc: ArcConfig = ArcConfig()
+    pressure: PressureConfig = PressureConfig()

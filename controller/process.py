@@ -1,0 +1,117 @@
+"""The 5 ms process: read the newest samples, tick, write the command, keep time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from softloop.controller.config import ControllerConfig
+from softloop.controller.records import INPUTS, PHASE_WAIT
+from softloop.controller.setup import PERIOD_NS, Controller, build
+from softloop.wire.channels import COMMAND, CYCLE, EVENT, INCLINATION, PRESSURE, VALVES
+from softloop.wire.clock import Deadlines
+from softloop.wire.messages import BadPayload, constant, message
+from softloop.wire.shell import Context
+from softloop.wire.status import StatusReporter
+
+_SOURCE = constant("Event", "SOURCE_CONTROLLER")
+_KIND_PHASE = constant("Event", "KIND_PHASE")
+_KIND_OVERRUN = constant("Event", "KIND_OVERRUN")
+
+
+def run(config: ControllerConfig, context: Context) -> None:
+    """Run the controller until asked to stop. Raises BadFile or BadConfig before the loop starts."""
+    loop = ControllerLoop(build(config), context)
+    loop.warm()
+    context.enter_loop()
+    deadlines = Deadlines(PERIOD_NS, context.clock.now_ns() + PERIOD_NS)
+    while not context.stop:
+        context.clock.sleep_until_ns(deadlines.next_ns)
+        loop.read(deadlines)
+        loop.controller.tick()
+        loop.write()
+        deadlines.advance(context.clock.now_ns())
+
+
+class ControllerLoop:
+    """The process's inputs, outputs and what it keeps between ticks."""
+
+    def __init__(self, controller: Controller, context: Context) -> None:
+        wire = context.wire
+        self.controller = controller
+        self.clock = context.clock
+        self.inputs = [self._input(wire.latest(c), name) for c, name in _INPUTS]
+        self.put_command, self.put_cycle, self.put_event = (wire.publisher(c) for c in (COMMAND, CYCLE, EVENT))
+        self.status = StatusReporter(context, _SOURCE)
+        self.command, self.event = message("ValveCommand"), message("Event")
+        self.record = message("CycleRecord")
+        self.phase = PHASE_WAIT
+        self.events = 0
+        self.woken_ns = 0
+
+    def _input(self, latest: Any, field: str) -> tuple[Any, Any, Any]:
+        """(source, message type, view of the bytes it is copied to) of one field of `INPUTS`."""
+        offset = INPUTS.fields[field][1]  # type: ignore[index]
+        kind = message(INPUT_MESSAGES[field])
+        raw = self.controller.inputs.view("u1")[offset : offset + kind.cdr_size]
+        return latest, kind, raw
+
+    def warm(self) -> None:
+        """One tick on empty inputs, so that nothing is loaded or compiled once the loop runs; then start afresh."""
+        before = self.controller.state.copy()
+        self.controller.tick()
+        self.controller.state[:] = before
+
+    def read(self, deadlines: Deadlines) -> None:
+        """The newest sample of every input; one that cannot be read leaves the last good one, whose age will tell."""
+        self.woken_ns = self.clock.now_ns()
+        inputs = self.controller.inputs[0]
+        inputs.now_ns, inputs.tick, inputs.skipped = deadlines.next_ns, deadlines.tick, deadlines.skipped
+        for latest, kind, raw in self.inputs:
+            payload = latest.take()
+            if payload is not None:
+                try:
+                    kind.unpack_into(payload, raw)
+                except BadPayload:
+                    self.status.dropped += 1
+
+    def write(self) -> None:
+        """Command first, then what is only for the log."""
+        cycle = self.controller.cycle[0]
+        cycle.woken_ns = self.woken_ns
+        cycle.computed_ns = self.clock.now_ns()
+        self.put_command(self._command(cycle))
+        cycle.published_ns = self.clock.now_ns()
+        self.put_cycle(self.record.pack_record(cycle))
+        if cycle.phase != self.phase:
+            self._say(_KIND_PHASE, code=int(cycle.phase))
+            self.phase = int(cycle.phase)
+        if cycle.skipped:
+            self._say(_KIND_OVERRUN, value=float(cycle.skipped))
+        self.status.cycle(late_ns=self.woken_ns - int(cycle.stamp_ns), skipped=int(cycle.skipped))
+
+    def _command(self, cycle: Any) -> bytes:
+        return self.command.pack(
+            self.command.make(
+                seq=int(cycle.seq),
+                stamp_ns=int(cycle.computed_ns),
+                tick=int(cycle.tick),
+                pressure_stamp_ns=int(cycle.pressure_stamp_ns),
+                inclination_stamp_ns=int(cycle.inclination_stamp_ns),
+                chamber_pressure_kpa=float(cycle.chamber_pressure_kpa),
+                angle_deg=float(cycle.angle_deg),
+                charge_current_ma=float(cycle.charge_current_ma),
+                exhaust_current_ma=float(cycle.exhaust_current_ma),
+                mode=int(cycle.mode),
+                ready=int(cycle.inputs_valid),
+            )
+        )
+
+    def _say(self, kind: int, code: int = 0, value: float = 0.0) -> None:
+        self.events += 1
+        cycle = self.controller.cycle[0]
+        fields = {"seq": self.events, "stamp_ns": int(cycle.stamp_ns), "tick": int(cycle.tick)}
+        self.put_event(self.event.pack(self.event.make(**fields, value=value, source=_SOURCE, kind=kind, code=code)))
+
+
+_INPUTS = ((PRESSURE, "pressure"), (INCLINATION, "inclination"), (VALVES, "valves"))
+INPUT_MESSAGES = {"pressure": PRESSURE.message, "inclination": INCLINATION.message, "valves": VALVES.message}

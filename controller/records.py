@@ -1,0 +1,147 @@
+"""The records the controller's kernels read and write: inputs, measurement, reference, gains, state."""
+
+from __future__ import annotations
+
+from softloop.dynamics.parameters import N_THETA
+from softloop.wire.kernel import record_dtype, record_type
+from softloop.wire.messages import constant, message
+
+PHASE_WAIT = constant("CycleRecord", "PHASE_WAIT")
+PHASE_APPROACH = constant("CycleRecord", "PHASE_APPROACH")
+PHASE_TRACK = constant("CycleRecord", "PHASE_TRACK")
+PHASE_DONE = constant("CycleRecord", "PHASE_DONE")
+MODE_CHARGE = constant("ValveCommand", "MODE_CHARGE")
+MODE_EXHAUST = constant("ValveCommand", "MODE_EXHAUST")
+MODE_HOLD = constant("ValveCommand", "MODE_HOLD")
+GATE_ARMED = constant("ValveStatus", "GATE_ARMED")
+OUTPUT_PASS = constant("ValveStatus", "OUTPUT_PASS")
+SAMPLE_OK = constant("PressureSample", "STATUS_OK")
+
+LAW_PID, LAW_ARC, LAW_PRESSURE = 0, 1, 2
+LAWS = {"pid": LAW_PID, "arc": LAW_ARC, "pressure": LAW_PRESSURE}
+MODES_TABLE_2, MODES_FLOW_DEMAND = 0, 1
+MODE_RULES = {"table2": MODES_TABLE_2, "flow": MODES_FLOW_DEMAND}
+
+CYCLE = message("CycleRecord").dtype
+
+# What lay on the inputs when the tick began: the newest message of each channel, whole.
+INPUTS = record_dtype(
+    [
+        ("now_ns", "i8"),
+        ("tick", "i8"),
+        ("skipped", "i8"),
+        ("pressure", message("PressureSample").dtype),
+        ("inclination", message("InclinationSample").dtype),
+        ("valves", message("ValveStatus").dtype),
+    ]
+)
+
+# What a law works on: the state brought to the time at which its command will act.
+MEASUREMENT = record_dtype(
+    [
+        ("angle_deg", "f8"),
+        ("rate_deg_s", "f8"),
+        ("chamber_kpa", "f8"),
+        ("supply_kpa", "f8"),
+        ("period_s", "f8"),  # since the last tick, skipped ones included
+        ("adapt", "u1"),  # 1 where inputs are fresh and the last command was not saturated
+    ]
+)
+
+# A point of a trajectory and its derivatives; of the angle in deg, or of the pressure in kPa for the pressure law.
+REFERENCE = record_dtype([("value", "f8"), ("rate", "f8"), ("acceleration", "f8"), ("jerk", "f8")])
+
+# What a law asks for, and what is worth logging of how it came to it.
+DEMAND = record_dtype(
+    [
+        ("flow_kpa_s", "f8"),  # pressure rate asked of the valves
+        ("desired_pressure_kpa", "f8"),
+        ("error", "f8"),
+        ("s1", "f8"),
+        ("s2", "f8"),
+        ("mode", "u1"),
+    ]
+)
+
+# How demanded flow becomes a working mode and currents; the same for every law.
+ACTUATION = record_dtype(
+    [
+        ("rule", "i8"),
+        ("flow_hold_kpa_s", "f8"),  # below this no valve is opened
+        ("error_hold", "f8"),  # epsilon_0 of Table 2, entering hold
+        ("error_release", "f8"),  # leaving hold
+        ("rate_still_deg_s", "f8"),  # a reference slower than this stands, where Table 2 says "= 0"
+        ("switch_ticks", "i8"),  # a mode stays at least this long
+        ("bias_fraction", "f8"),  # the closed valve waits at this fraction of its opening current
+        ("current_max_ma", "f8"),
+    ]
+)
+
+PID_GAINS = record_dtype(
+    [(n, "f8") for n in ("kp", "ki", "kd", "kv", "ka", "integral_max_kpa", "pressure_gain", "desired_max_kpa")]
+)
+ARC_GAINS = record_dtype(
+    [
+        *[(n, "f8") for n in ("k_s", "k1", "k2", "rho", "epsilon1", "epsilon2", "delta1", "delta2", "desired_max_kpa")],
+        ("gamma", "f8", (N_THETA,)),
+        ("rate_limit", "f8", (N_THETA,)),
+    ]
+)
+PRESSURE_GAINS = record_dtype([(n, "f8") for n in ("k2", "epsilon2", "delta2")])
+GAINS = record_dtype([("actuation", ACTUATION), ("pid", PID_GAINS), ("arc", ARC_GAINS), ("pressure", PRESSURE_GAINS)])
+
+PID_STATE = record_dtype([("integral_kpa", "f8")])
+ARC_STATE = record_dtype([("phi", "f8", (N_THETA,)), ("tau", "f8", (N_THETA,))])
+CONTROLLER_STATE = record_dtype(
+    [
+        ("theta", "f8", (N_THETA,)),
+        ("seq", "i8"),
+        ("skipped_total", "i8"),
+        ("last_ns", "i8"),
+        ("phase_start_ns", "i8"),
+        ("approach", "f8", (8,)),
+        ("approach_ns", "i8"),
+        ("charge_ma", "f8"),  # the last two commands, for prediction
+        ("exhaust_ma", "f8"),
+        ("charge_before_ma", "f8"),
+        ("exhaust_before_ma", "f8"),
+        ("mode_ticks", "i8"),
+        ("pid", PID_STATE),
+        ("arc", ARC_STATE),
+        ("phase", "u1"),
+        ("mode", "u1"),
+        ("saturated", "u1"),
+        ("started", "u1"),
+    ]
+)
+
+CONFIG = record_dtype(
+    [
+        ("law", "i8"),
+        ("period_ns", "i8"),
+        ("approach_ns", "i8"),
+        ("plan_kind", "i8"),
+        ("plan_ns", "i8"),
+        ("pressure_budget_ns", "i8"),
+        ("inclination_budget_ns", "i8"),
+        ("pressure_delay_ns", "i8"),  # declared lag of the sensor ahead of its stamp
+        ("inclination_delay_ns", "i8"),
+        ("actuation_delay_ns", "i8"),  # from tick to valve opening
+        ("predict", "u1"),
+    ]
+)
+
+INPUTS_TYPE = record_type(INPUTS)
+MEASUREMENT_TYPE = record_type(MEASUREMENT)
+REFERENCE_TYPE = record_type(REFERENCE)
+DEMAND_TYPE = record_type(DEMAND)
+ACTUATION_TYPE = record_type(ACTUATION)
+GAINS_TYPE = record_type(GAINS)
+PID_GAINS_TYPE = record_type(PID_GAINS)
+ARC_GAINS_TYPE = record_type(ARC_GAINS)
+PRESSURE_GAINS_TYPE = record_type(PRESSURE_GAINS)
+PID_STATE_TYPE = record_type(PID_STATE)
+ARC_STATE_TYPE = record_type(ARC_STATE)
+STATE_TYPE = record_type(CONTROLLER_STATE)
+CONFIG_TYPE = record_type(CONFIG)
+CYCLE_TYPE = record_type(CYCLE)

@@ -1,0 +1,133 @@
+"""From the bench file's `[controller]` to the records that the kernels read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softloop.controller import references
+from softloop.controller.config import ControllerConfig
+from softloop.controller.feasibility import check_angle_plan, check_pressure_plan
+from softloop.controller.laws.arc import STEP1
+from softloop.controller.records import CONFIG, CONTROLLER_STATE, CYCLE, GAINS, INPUTS, LAW_PRESSURE, LAWS, MODE_HOLD, MODE_RULES
+from softloop.controller.references import Plan
+from softloop.controller.tick import SCRATCH, controller_tick
+from softloop.dynamics.parameters import B0, Parameters, load_parameters, model_record, shipped
+from softloop.wire.errors import BadConfig
+from softloop.wire.kernel import new_record
+
+PERIOD_NS = 5_000_000  # the paper's sampling time
+MS = 1_000_000
+
+
+@dataclass
+class Controller:
+    """One controller, ready to tick: its records and its trajectory. `inputs` is filled from outside."""
+
+    config: Any
+    model: Any
+    gains: Any
+    plan: Plan
+    inputs: NDArray[Any]
+    state: NDArray[Any]
+    cycle: NDArray[Any]
+    scratch: Any
+    first: Any
+
+    def tick(self) -> Any:
+        """Run one tick on `inputs`; returns the filled cycle record."""
+        plan, cycle = self.plan, self.cycle[0]
+        controller_tick(
+            self.config, self.model, self.gains, plan.knots, plan.table, self.inputs[0], self.state[0], self.scratch, self.first,
+            cycle,
+        )  # fmt: skip
+        return cycle
+
+
+def parameters_of(config: ControllerConfig) -> Parameters:
+    """The parameter file a controller runs on. Raises BadFile or BadConfig."""
+    named = shipped(config.parameters)
+    return load_parameters(named if named.is_file() else Path(config.parameters))
+
+
+def plan_of(config: ControllerConfig) -> Plan:
+    """The trajectory a controller follows. Raises BadConfig when it does not fit the law, BadFile for a bad CSV file."""
+    name, seed = config.trajectory, config.trajectory_seed
+    excitations = {"excitation_1hz": 1.0, "excitation_05hz": 0.5}
+    if name in excitations:
+        if config.law != "pressure":
+            raise BadConfig(f"[controller] trajectory '{name}' is a pressure; it needs law = \"pressure\"")
+        return references.excitation(excitations[name], seed)
+    if name in ("t1", "t2"):
+        if config.law == "pressure":
+            raise BadConfig(f"[controller] trajectory '{name}' is an angle; law \"pressure\" needs an excitation or a CSV in kPa")
+        return references.point_to_point() if name == "t1" else references.t2(seed)
+    path = Path(name)
+    if not path.is_file():
+        raise BadConfig(f"[controller] trajectory '{name}': no such file, and not one of t1, t2, {', '.join(excitations)}")
+    return references.from_csv(path)
+
+
+def build(config: ControllerConfig) -> Controller:
+    """All records of a controller. Raises BadFile or BadConfig; BadConfig too when the trajectory is not feasible."""
+    model = model_record(parameters_of(config))
+    plan = plan_of(config)
+    (check_pressure_plan if config.law == "pressure" else check_angle_plan)(plan, model)
+    state = np.zeros(1, CONTROLLER_STATE)
+    state[0].theta[:] = model.theta
+    state[0].mode = MODE_HOLD
+    return Controller(
+        config=config_record(config, plan),
+        model=model,
+        gains=gains_record(config, model),
+        plan=plan,
+        inputs=np.zeros(1, INPUTS),
+        state=state,
+        cycle=np.zeros(1, CYCLE),
+        scratch=new_record(SCRATCH),
+        first=new_record(STEP1),
+    )
+
+
+def config_record(config: ControllerConfig, plan: Plan) -> Any:
+    """The `CONFIG` record."""
+    record = new_record(CONFIG)
+    record.law = LAWS[config.law]
+    record.period_ns = PERIOD_NS
+    record.approach_ns = round(config.approach_s * 1e9)
+    record.plan_kind, record.plan_ns = plan.kind, plan.duration_ns
+    record.pressure_budget_ns = round(config.pressure_budget_ms * MS)
+    record.inclination_budget_ns = round(config.inclination_budget_ms * MS)
+    record.pressure_delay_ns = round(config.pressure_delay_ms * MS)
+    record.inclination_delay_ns = round(config.inclination_delay_ms * MS)
+    record.actuation_delay_ns = round(config.actuation_delay_ms * MS)
+    record.predict = config.predict
+    return record
+
+
+def gains_record(config: ControllerConfig, model: Any) -> Any:
+    """The `GAINS` record; adaptation gains and rates are scaled by the width of each parameter's bounds."""
+    gains = new_record(GAINS)
+    actuation = config.actuation
+    gains.actuation.rule = MODE_RULES[actuation.modes]
+    gains.actuation.flow_hold_kpa_s = actuation.flow_hold_kpa_s
+    gains.actuation.error_hold, gains.actuation.error_release = actuation.error_hold_deg, actuation.error_release_deg
+    gains.actuation.rate_still_deg_s = actuation.rate_still_deg_s
+    if LAWS[config.law] == LAW_PRESSURE:  # its error is a pressure and its trajectory never dwells
+        gains.actuation.rate_still_deg_s = -1.0
+    gains.actuation.switch_ticks = actuation.switch_ticks
+    gains.actuation.bias_fraction = actuation.bias_fraction
+    gains.actuation.current_max_ma = model.current_max_ma
+    for record, table in ((gains.pid, config.pid), (gains.arc, config.arc), (gains.pressure, config.pressure)):
+        for name in record.dtype.names:
+            if name in type(table).model_fields and name not in ("gamma", "rate_limit"):
+                record[name] = getattr(table, name)
+    width = model.theta_max - model.theta_min
+    gains.arc.gamma[:] = config.arc.gamma_valve * width**2
+    gains.arc.gamma[: B0 + 1] = config.arc.gamma * width[: B0 + 1] ** 2
+    gains.arc.rate_limit[:] = config.arc.rate_limit * width
+    return gains

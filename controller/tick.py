@@ -1,0 +1,224 @@
+"""One tick of the controller, whole: inputs in, cycle record out. Pure in its arguments, so a log replays to the byte."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import types
+
+from softloop.controller.actuation import actuate
+from softloop.controller.estimator import measure
+from softloop.controller.laws.arc import STEP1_TYPE, arc_step
+from softloop.controller.laws.pid import pid_step
+from softloop.controller.laws.pressure import pressure_step
+from softloop.controller.records import (
+    CONFIG_TYPE,
+    CYCLE_TYPE,
+    DEMAND,
+    DEMAND_TYPE,
+    GAINS_TYPE,
+    GATE_ARMED,
+    INPUTS_TYPE,
+    LAW_ARC,
+    LAW_PID,
+    LAW_PRESSURE,
+    MEASUREMENT,
+    MEASUREMENT_TYPE,
+    MODE_HOLD,
+    PHASE_APPROACH,
+    PHASE_DONE,
+    PHASE_TRACK,
+    PHASE_WAIT,
+    REFERENCE,
+    REFERENCE_TYPE,
+    SAMPLE_OK,
+    STATE_TYPE,
+)
+from softloop.controller.references import polynomial_at, reference_at
+from softloop.dynamics.parameters import MODEL_TYPE, THETA_TYPE
+from softloop.wire.kernel import array_of, kernel, record_dtype, record_type
+
+_F8 = types.f8
+
+SCRATCH = record_dtype([("measurement", MEASUREMENT), ("reference", REFERENCE), ("demand", DEMAND), ("end", REFERENCE)])
+SCRATCH_TYPE = record_type(SCRATCH)
+
+
+@kernel(types.b1(CONFIG_TYPE, INPUTS_TYPE))
+def inputs_valid(config: Any, inputs: Any) -> bool:
+    """Every input has come, is fresh, says that it is good, and is a number."""
+    if inputs.pressure.seq == 0 or inputs.inclination.seq == 0 or inputs.valves.seq == 0:
+        return False
+    if inputs.now_ns - inputs.pressure.stamp_ns > config.pressure_budget_ns:
+        return False
+    if inputs.now_ns - inputs.inclination.stamp_ns > config.inclination_budget_ns:
+        return False
+    numbers = inputs.pressure.supply_pressure_kpa + inputs.pressure.chamber_pressure_kpa
+    numbers += inputs.inclination.angle_deg + inputs.inclination.rate_deg_s
+    return bool(inputs.pressure.status == SAMPLE_OK and np.isfinite(numbers))
+
+
+@kernel(types.void(_F8, REFERENCE_TYPE, _F8, THETA_TYPE))
+def move_between(start: float, end: Any, seconds: float, coefficients: np.ndarray) -> None:
+    """The polynomial of degree seven from rest at `start` to `end` with its derivatives; see `references.smooth_move`.
+
+    In time over `seconds` the four open coefficients follow from the four end conditions in closed form.
+    """
+    gap = end.value - start
+    v, a, j = end.rate * seconds, end.acceleration * seconds**2, end.jerk * seconds**3
+    coefficients[0] = start
+    coefficients[1], coefficients[2], coefficients[3] = 0.0, 0.0, 0.0
+    coefficients[4] = (35.0 * gap - 15.0 * v + 2.5 * a - j / 6.0) / seconds**4
+    coefficients[5] = (-84.0 * gap + 39.0 * v - 7.0 * a + 0.5 * j) / seconds**5
+    coefficients[6] = (70.0 * gap - 34.0 * v + 6.5 * a - 0.5 * j) / seconds**6
+    coefficients[7] = (-20.0 * gap + 10.0 * v - 2.0 * a + j / 6.0) / seconds**7
+
+
+@kernel(types.void(CONFIG_TYPE, INPUTS_TYPE, array_of(_F8), array_of(_F8, 2), STATE_TYPE, SCRATCH_TYPE))
+def begin_approach(config: Any, inputs: Any, knots: np.ndarray, table: np.ndarray, state: Any, scratch: Any) -> None:
+    """Start the smooth move from where the rig is to the trajectory's first point (value and three derivatives)."""
+    reference_at(config.plan_kind, knots, table, 0.0, scratch.end)
+    start = inputs.pressure.chamber_pressure_kpa if config.law == LAW_PRESSURE else inputs.inclination.angle_deg
+    move_between(start, scratch.end, 1e-9 * config.approach_ns, state.approach)
+    state.phase = PHASE_APPROACH
+    state.phase_start_ns = inputs.now_ns
+    state.pid.integral_kpa = inputs.pressure.chamber_pressure_kpa
+    state.mode = MODE_HOLD
+    state.mode_ticks = 0
+
+
+@kernel(types.void(CONFIG_TYPE, INPUTS_TYPE, array_of(_F8), array_of(_F8, 2), STATE_TYPE, SCRATCH_TYPE))
+def follow_phase(config: Any, inputs: Any, knots: np.ndarray, table: np.ndarray, state: Any, scratch: Any) -> None:
+    """WAIT -> APPROACH once armed with valid inputs -> TRACK -> DONE; back to WAIT whenever the gate is not armed."""
+    armed = inputs.valves.gate == GATE_ARMED
+    if not armed and state.phase != PHASE_DONE:
+        state.phase = PHASE_WAIT
+    if state.phase == PHASE_WAIT and armed and inputs_valid(config, inputs):
+        begin_approach(config, inputs, knots, table, state, scratch)
+    if state.phase == PHASE_APPROACH and inputs.now_ns - state.phase_start_ns >= config.approach_ns:
+        state.phase = PHASE_TRACK
+        state.phase_start_ns += config.approach_ns
+    if state.phase == PHASE_TRACK and inputs.now_ns - state.phase_start_ns >= config.plan_ns:
+        state.phase = PHASE_DONE
+
+
+@kernel(types.void(CONFIG_TYPE, array_of(_F8), array_of(_F8, 2), STATE_TYPE, types.i8, REFERENCE_TYPE))
+def reference_now(config: Any, knots: np.ndarray, table: np.ndarray, state: Any, now_ns: int, reference: Any) -> None:
+    """The point of the trajectory, or of the move towards it, that stands at `now_ns`."""
+    if state.phase == PHASE_TRACK or state.phase == PHASE_DONE:
+        reference_at(config.plan_kind, knots, table, 1e-9 * (now_ns - state.phase_start_ns), reference)
+    elif state.phase == PHASE_APPROACH and now_ns - state.phase_start_ns >= config.approach_ns:
+        past_ns = now_ns - state.phase_start_ns - config.approach_ns
+        reference_at(config.plan_kind, knots, table, 1e-9 * past_ns, reference)
+    else:
+        polynomial_at(state.approach, 1e-9 * (now_ns - state.phase_start_ns), reference)
+
+
+@kernel(types.void(types.i8, MODEL_TYPE, MEASUREMENT_TYPE, REFERENCE_TYPE, GAINS_TYPE, STATE_TYPE, STEP1_TYPE, DEMAND_TYPE))
+def law_step(
+    law: int, model: Any, measurement: Any, reference: Any, gains: Any, state: Any, first: Any, demand: Any
+) -> None:
+    """The law of this run; a new law is one more line here and one file beside the others."""
+    if law == LAW_PID:
+        pid_step(measurement, reference, gains, state, demand)
+    elif law == LAW_ARC:
+        arc_step(model, measurement, reference, gains, state, first, demand)
+    elif law == LAW_PRESSURE:
+        pressure_step(measurement, reference, gains, state, demand)
+
+
+@kernel(types.void(STATE_TYPE, DEMAND_TYPE))
+def stand_still(state: Any, demand: Any) -> None:
+    """Ask for nothing: both currents zero, which the gate passes on only as its own safe output."""
+    state.charge_before_ma, state.exhaust_before_ma = state.charge_ma, state.exhaust_ma
+    state.charge_ma, state.exhaust_ma = 0.0, 0.0
+    state.mode, state.saturated = MODE_HOLD, 0
+    demand.flow_kpa_s, demand.desired_pressure_kpa = 0.0, 0.0
+    demand.error, demand.s1, demand.s2, demand.mode = 0.0, 0.0, 0.0, MODE_HOLD
+
+
+@kernel(types.void(INPUTS_TYPE, STATE_TYPE, CYCLE_TYPE))
+def record_inputs(inputs: Any, state: Any, cycle: Any) -> None:
+    """What this tick saw, into the cycle record."""
+    cycle.seq, cycle.stamp_ns, cycle.tick = state.seq, inputs.now_ns, inputs.tick
+    cycle.skipped, cycle.skipped_total = inputs.skipped, state.skipped_total
+    cycle.pressure_seq, cycle.pressure_stamp_ns = inputs.pressure.seq, inputs.pressure.stamp_ns
+    cycle.pressure_age_ns = inputs.now_ns - inputs.pressure.stamp_ns
+    cycle.inclination_seq, cycle.inclination_stamp_ns = inputs.inclination.seq, inputs.inclination.stamp_ns
+    cycle.inclination_age_ns = inputs.now_ns - inputs.inclination.stamp_ns
+    cycle.valve_seq, cycle.valve_stamp_ns = inputs.valves.seq, inputs.valves.stamp_ns
+    cycle.supply_pressure_kpa = inputs.pressure.supply_pressure_kpa
+    cycle.chamber_pressure_kpa = inputs.pressure.chamber_pressure_kpa
+    cycle.angle_deg, cycle.rate_deg_s = inputs.inclination.angle_deg, inputs.inclination.rate_deg_s
+    cycle.charge_applied_ma, cycle.exhaust_applied_ma = inputs.valves.charge_current_ma, inputs.valves.exhaust_current_ma
+    cycle.gate = inputs.valves.gate
+
+
+@kernel(types.void(CONFIG_TYPE, MEASUREMENT_TYPE, REFERENCE_TYPE, DEMAND_TYPE, STATE_TYPE, types.b1, CYCLE_TYPE))
+def record_thoughts(
+    config: Any, measurement: Any, reference: Any, demand: Any, state: Any, valid: bool, cycle: Any
+) -> None:
+    """What this tick made of it, into the cycle record."""
+    on_plan = state.phase == PHASE_TRACK or state.phase == PHASE_DONE
+    cycle.trajectory_ns = cycle.stamp_ns - state.phase_start_ns - (0 if on_plan else config.approach_ns)
+    cycle.reference_deg, cycle.reference_rate_deg_s = reference.value, reference.rate
+    cycle.reference_acceleration_deg_s2, cycle.reference_jerk_deg_s3 = reference.acceleration, reference.jerk
+    if config.law == LAW_PRESSURE:  # its trajectory is a pressure and stands in desired_pressure_kpa
+        cycle.reference_deg, cycle.reference_rate_deg_s = np.nan, np.nan
+        cycle.reference_acceleration_deg_s2, cycle.reference_jerk_deg_s3 = np.nan, np.nan
+    cycle.angle_estimate_deg, cycle.rate_estimate_deg_s = measurement.angle_deg, measurement.rate_deg_s
+    cycle.disturbance_deg_s2 = 0.0
+    cycle.error_deg, cycle.s1_deg_s, cycle.s2_kpa = demand.error, demand.s1, demand.s2
+    cycle.desired_pressure_kpa, cycle.demanded_flow_kpa_s = demand.desired_pressure_kpa, demand.flow_kpa_s
+    cycle.charge_current_ma, cycle.exhaust_current_ma = state.charge_ma, state.exhaust_ma
+    for i in range(state.theta.size):
+        cycle.theta[i] = state.theta[i]
+    cycle.internal[0] = measurement.chamber_kpa
+    cycle.internal[1] = measurement.supply_kpa
+    cycle.internal[2] = measurement.period_s
+    cycle.internal[3] = state.pid.integral_kpa
+    cycle.internal[4] = state.mode_ticks
+    cycle.phase, cycle.mode = state.phase, state.mode
+    cycle.inputs_valid, cycle.saturated, cycle.adapting = valid, state.saturated, measurement.adapt
+
+
+@kernel(
+    types.void(
+        CONFIG_TYPE, MODEL_TYPE, GAINS_TYPE, array_of(_F8), array_of(_F8, 2), INPUTS_TYPE, STATE_TYPE, SCRATCH_TYPE, STEP1_TYPE,
+        CYCLE_TYPE,
+    )
+)  # fmt: skip
+def controller_tick(
+    config: Any, model: Any, gains: Any, knots: np.ndarray, table: np.ndarray, inputs: Any, state: Any, scratch: Any,
+    first: Any, cycle: Any,
+) -> None:  # fmt: skip
+    """Read `inputs`, move `state`, write the whole of `cycle` but the instants only the process knows.
+
+    Args:
+        config: `CONFIG` record.
+        model: `MODEL` record with nominal parameters and bounds.
+        gains: `GAINS` record.
+        knots, table: the trajectory, see `references`.
+        inputs: `INPUTS` record.
+        state: `CONTROLLER_STATE` record; `state.theta` must hold the parameters to start from.
+        scratch, first: records of `SCRATCH` and `STEP1` to work in.
+        cycle: `CycleRecord` to fill.
+    """
+    measurement, reference, demand = scratch.measurement, scratch.reference, scratch.demand
+    valid = inputs_valid(config, inputs)
+    follow_phase(config, inputs, knots, table, state, scratch)
+    measure(config, model, inputs, state, measurement)
+    measurement.adapt = valid and state.saturated == 0 and state.phase != PHASE_WAIT
+    acts_ns = inputs.now_ns + (config.actuation_delay_ns if config.predict else 0)
+    reference_now(config, knots, table, state, acts_ns, reference)
+    if state.phase == PHASE_APPROACH or state.phase == PHASE_TRACK:
+        law_step(config.law, model, measurement, reference, gains, state, first, demand)
+        actuate(gains.actuation, model, measurement, demand, state)
+    else:
+        stand_still(state, demand)
+    state.last_ns = inputs.now_ns
+    state.seq += 1
+    state.skipped_total += inputs.skipped
+    record_inputs(inputs, state, cycle)
+    record_thoughts(config, measurement, reference, demand, state, valid, cycle)

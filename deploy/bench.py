@@ -1,0 +1,193 @@
+"""The bench file: all tables of a rig in one model, with errors that name the key, the file and what is allowed.
+
+Two keys at the top make one bench out of another. `base = "sim.toml"` takes over the tables of that file (found beside this
+one); what stands in this file replaces key by key what stands there. `without = ["plant"]` leaves out tables of the base.
+In every text value `{run_dir}` means the run directory and `{bench_dir}` the folder of the file it stands in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, ValidationError
+
+from softloop.controller.config import ControllerConfig
+from softloop.deploy.config import RunConfig
+from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig
+from softloop.plant.config import PlantConfig
+from softloop.watch.config import RecorderConfig
+from softloop.wire.benchfile import Table, load_model, read_toml
+from softloop.wire.can_config import CanConfig
+from softloop.wire.config import HostConfig, ZenohConfig
+from softloop.wire.errors import BadConfig, BadFile
+
+NAME = r"^[a-z0-9_-]{1,24}$"
+MAX_BASES = 8
+# Which keys name a CAN bus; each must be a [can.NAME] of the same bench.
+CAN_KEYS = (("plant", "can_valves"), ("plant", "can_analog"), ("valves", "can"), ("pressures", "can"))
+
+Key = tuple[str, ...]
+
+
+class Bench(Table):
+    """A whole bench. A process runs when its table stands in the file."""
+
+    name: str = Field(pattern=NAME, description="part of every Zenoh key: a-z, 0-9, _ and -, at most 24")
+    zenoh: ZenohConfig = ZenohConfig()
+    host: HostConfig = HostConfig()
+    run: RunConfig = RunConfig()
+    can: dict[str, CanConfig] = {}
+    plant: PlantConfig | None = None
+    valves: ValvesConfig | None = None
+    pressures: PressuresConfig | None = None
+    inclinometer: InclinometerConfig | None = None
+    controller: ControllerConfig | None = None
+    recorder: RecorderConfig | None = None
+
+
+@dataclass(frozen=True)
+class Source:
+    """The merged content of a bench file and its bases, and which file each key came from."""
+
+    file: Path
+    content: dict[str, Any]
+    origins: dict[Key, Path] = field(default_factory=dict)
+
+    def origin(self, where: Key) -> Path:
+        """The file in which a key, or the nearest table around it, stands."""
+        for length in range(len(where), 0, -1):
+            if where[:length] in self.origins:
+                return self.origins[where[:length]]
+        return self.file
+
+
+def shipped_benches() -> dict[str, Path]:
+    """Name -> file of the benches that come with the package."""
+    folder = Path(str(resources.files("softloop.deploy") / "benches"))
+    return {p.stem: p for p in sorted(folder.glob("*.toml"))}
+
+
+def find_bench(path: Path) -> Path:
+    """The bench file at `path`, or the shipped one of that name. Raises BadFile when there is neither."""
+    if path.is_file():
+        return path
+    shipped = shipped_benches()
+    if str(path) in shipped:
+        return shipped[str(path)]
+    raise BadFile(f"{path}: there is no such bench file; shipped ones go by name: {', '.join(shipped)}")
+
+
+def read_source(path: Path, run_dir: Path | None = None) -> Source:
+    """Read a bench file with its bases, texts substituted. Raises BadFile or BadConfig with one line."""
+    content: dict[str, Any] = {}
+    origins: dict[Key, Path] = {}
+    for file, own in reversed(_chain(path)):
+        for name in own.pop("without", []):
+            _remove(content, origins, name, file)
+        own.pop("base", None)
+        _merge(content, origins, _substituted(own, file, run_dir), file, ())
+    return Source(path, content, origins)
+
+
+def load_bench(path: Path, run_dir: Path | None = None) -> Bench:
+    """Read and check a bench.
+
+    Args:
+        path: the file.
+        run_dir: what `{run_dir}` becomes; without it the text stays as it is (enough to check a file).
+
+    Raises:
+        BadFile, BadConfig: one line with file, key, fault and what is allowed.
+    """
+    return validate(read_source(path, run_dir))
+
+
+def validate(source: Source) -> Bench:
+    """The bench in `source`. Raises BadConfig as `load_bench` does."""
+    try:
+        bench = Bench.model_validate(source.content)
+    except ValidationError as error:
+        where = tuple(str(part) for part in error.errors()[0]["loc"])
+        return load_model(Bench, source.content, source.origin(where))  # says it in one line
+    _check_can_names(bench, source)
+    return bench
+
+
+def _check_can_names(bench: Bench, source: Source) -> None:
+    for table, key in CAN_KEYS:
+        used = getattr(getattr(bench, table), key, None)
+        if used is not None and used not in bench.can:
+            known = ", ".join(sorted(bench.can)) or "none: add a [can.NAME] table"
+            raise BadConfig(f"{source.origin((table, key))}: key '{table}.{key}': no CAN bus '{used}'; there are: {known}")
+
+
+def _chain(path: Path) -> list[tuple[Path, dict[str, Any]]]:
+    """The file and its bases, each with its content, the file itself first."""
+    chain: list[tuple[Path, dict[str, Any]]] = []
+    file: Path | None = path
+    while file is not None:
+        if len(chain) == MAX_BASES:
+            raise BadConfig(f"{path}: key 'base': more than {MAX_BASES} files deep; does a file name itself as its base?")
+        own = read_toml(file)
+        _check_head(file, own)
+        chain.append((file, own))
+        file = _base_of(file, own)
+    return chain
+
+
+def _check_head(file: Path, own: dict[str, Any]) -> None:
+    if not isinstance(own.get("base", ""), str):
+        raise BadConfig(f"{file}: key 'base': must be the name of a bench file in quotes (got {own['base']!r})")
+    without = own.get("without", [])
+    if not isinstance(without, list) or not all(isinstance(name, str) for name in without):
+        raise BadConfig(f"{file}: key 'without': must be a list of table names in quotes (got {without!r})")
+
+
+def _base_of(file: Path, own: dict[str, Any]) -> Path | None:
+    if "base" not in own:
+        return None
+    base = file.parent / own["base"]
+    if not base.is_file():
+        raise BadFile(f"{file}: key 'base': there is no file {base}")
+    return base
+
+
+def _remove(content: dict[str, Any], origins: dict[Key, Path], name: str, file: Path) -> None:
+    *outer, last = name.split(".")
+    table: Any = content
+    for part in outer:
+        table = table.get(part, {}) if isinstance(table, dict) else {}
+    if not isinstance(table, dict) or last not in table:
+        raise BadConfig(f"{file}: key 'without': the base has no '{name}'; it has: {', '.join(sorted(content))}")
+    del table[last]
+    gone = (*outer, last)
+    for key in [k for k in origins if k[: len(gone)] == gone]:
+        del origins[key]
+
+
+def _merge(content: dict[str, Any], origins: dict[Key, Path], own: dict[str, Any], file: Path, where: Key) -> None:
+    """Put `own` over `content`, table by table and key by key, and note which file each key is from."""
+    for key, value in own.items():
+        here = (*where, key)
+        origins[here] = file
+        if isinstance(value, dict) and isinstance(content.get(key), dict):
+            _merge(content[key], origins, value, file, here)
+        elif isinstance(value, dict):
+            content[key] = {}
+            _merge(content[key], origins, value, file, here)
+        else:
+            content[key] = value
+
+
+def _substituted(value: Any, file: Path, run_dir: Path | None) -> Any:
+    if isinstance(value, dict):
+        return {key: _substituted(inner, file, run_dir) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_substituted(inner, file, run_dir) for inner in value]
+    if not isinstance(value, str):
+        return value
+    value = value.replace("{bench_dir}", str(file.parent.resolve()))
+    return value if run_dir is None else value.replace("{run_dir}", str(run_dir.resolve()))

@@ -1,0 +1,22 @@
+"""`[run]`: what the launcher does around a run."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from softloop.wire.benchfile import Table
+
+
+class RunConfig(Table):
+    """`[run]`: arming, time limits and what is left at the end."""
+
+    arm: bool = Field(True, description="arm the gate once every process is alive; false: wait for `softloop request`")
+    shared_router: bool = Field(False, description="join the meeting point of a `softloop router` instead of being it")
+    folder: str = Field("runs", description="where run directories are made")
+    duration_s: float = Field(0.0, ge=0, description="end after this time, armed; 0: when the controller is done")
+    ready_timeout_s: float = Field(30.0, gt=0, description="every process must be alive by then")
+    arm_timeout_s: float = Field(10.0, gt=0, description="the gate must be armed by then, after all are alive")
+    vent_timeout_s: float = Field(3.0, ge=0, description="at the end, wait no longer than this for the chamber to vent")
+    vented_kpa: float = Field(2.0, gt=0, description="gauge pressure under which the chamber counts as vented")
+    stop_timeout_s: float = Field(5.0, gt=0, description="a process that has not ended by then is killed")
+    report: bool = True

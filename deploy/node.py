@@ -1,0 +1,83 @@
+"""One process of a bench: which module it is, which config it gets, and its life inside the process shell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from softloop.deploy.bench import Bench, load_bench
+from softloop.wire.errors import BadConfig
+from softloop.wire.shell import Context, run_process
+
+
+@dataclass(frozen=True)
+class Process:
+    """One kind of process. Its name is that of its table in the bench file.
+
+    Attributes:
+        name: the process and its table.
+        module: where its `run(config, context)` stands.
+        realtime: it is on the 5 ms path and takes real-time priority where the machine grants it.
+        source: the constant `SOURCE_*` of `Event.msg` by which it names itself in its `ProcessStatus`.
+        config: makes its config object from the bench.
+    """
+
+    name: str
+    module: str
+    realtime: bool
+    source: str
+    config: Callable[[Bench], Any]
+
+
+# In the order in which they are started; any order works.
+PROCESSES = (
+    Process("recorder", "softloop.watch.recorder", False, "SOURCE_RECORDER", lambda bench: bench.recorder),
+    Process("plant", "softloop.plant.process", True, "SOURCE_PLANT", lambda bench: bench.plant),
+    Process("valves", "softloop.devices.valves", True, "SOURCE_GATE", lambda bench: bench.valves),
+    Process("pressures", "softloop.devices.pressures", True, "SOURCE_PRESSURES", lambda bench: bench.pressures),
+    Process("inclinometer", "softloop.devices.inclinometer", True, "SOURCE_INCLINOMETER", lambda bench: bench.inclinometer),
+    Process("controller", "softloop.controller.process", True, "SOURCE_CONTROLLER", lambda bench: bench.controller),
+)
+# Together in each group. The gate vents while the plant still runs, and the recorder sees all of it.
+STOP_ORDER = (("controller",), ("valves",), ("pressures", "inclinometer", "plant"), ("recorder",))
+
+
+def processes_of(bench: Bench) -> tuple[Process, ...]:
+    """The processes whose tables stand in the bench."""
+    return tuple(p for p in PROCESSES if getattr(bench, p.name) is not None)
+
+
+def find_process(bench: Bench, name: str) -> Process:
+    """The process called `name`. Raises BadConfig when the bench has none."""
+    here = processes_of(bench)
+    found = next((p for p in here if p.name == name), None)
+    if found is None:
+        raise BadConfig(f"bench '{bench.name}' has no process '{name}'; it has: {', '.join(p.name for p in here) or 'none'}")
+    return found
+
+
+def run_node(name: str, bench_file: Path, run_dir: Path, lifeline_fd: int | None = None) -> int:
+    """Be one process of a bench until asked to stop; returns its exit code.
+
+    Raises:
+        SoftloopError: the bench file is wrong, or has no such process.
+    """
+    bench = load_bench(bench_file, run_dir)
+    process = find_process(bench, name)
+
+    def body(context: Context) -> None:
+        import_module(process.module).run(process.config(bench), context)
+
+    return run_process(
+        name,
+        body,
+        bench=bench.name,
+        zenoh=bench.zenoh,
+        host=bench.host,
+        run_dir=run_dir,
+        lifeline_fd=lifeline_fd,
+        realtime=process.realtime,
+    )

@@ -1,0 +1,115 @@
+"""What the launcher knows of a running rig: the newest sample of each channel it watches, and what happened."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from softloop.deploy.node import PROCESSES
+from softloop.wire.channels import CYCLE, EVENT, PRESSURE, STATUS, VALVES
+from softloop.wire.messages import BadPayload, constant, message, names_of
+from softloop.wire.session import Wire
+
+GATE_DISARMED = constant("ValveStatus", "GATE_DISARMED")
+GATE_ARMED = constant("ValveStatus", "GATE_ARMED")
+GATE_FAULT = constant("ValveStatus", "GATE_FAULT")
+OUTPUT_CLOSED = constant("ValveStatus", "OUTPUT_CLOSED")
+PHASE_DONE = constant("CycleRecord", "PHASE_DONE")
+GATES = names_of("ValveStatus", "GATE_")
+OUTPUTS = names_of("ValveStatus", "OUTPUT_")
+REASONS = names_of("ValveStatus", "REASON_")
+DRIVERS = names_of("ValveStatus", "DRIVER_")
+PHASES = names_of("CycleRecord", "PHASE_")
+LOADS = {1: "payload", 2: "contact"}
+_KINDS = names_of("Event", "KIND_")
+
+
+class RigState:
+    """The newest of each watched channel. `refresh` takes what came; the fields are messages or None."""
+
+    def __init__(self, wire: Wire) -> None:
+        self._cycles = wire.latest(CYCLE)
+        self._valves = wire.latest(VALVES)
+        self._pressures = wire.latest(PRESSURE)
+        self._statuses = wire.inbox(STATUS)
+        self._events = wire.inbox(EVENT)
+        self._source_names = {constant("Event", p.source): p.name for p in PROCESSES}
+        self.cycle: Any = None
+        self.valves: Any = None
+        self.pressure: Any = None
+        self.statuses: dict[str, Any] = {}
+        self.valves_heard_ns = 0
+
+    def refresh(self) -> list[str]:
+        """Take what came since the last call; returns one line for each event in it."""
+        self.cycle = _newest(self._cycles.take(), "CycleRecord", self.cycle)
+        self.pressure = _newest(self._pressures.take(), "PressureSample", self.pressure)
+        payload = self._valves.take()
+        if payload is not None:
+            self.valves_heard_ns = time.monotonic_ns()
+            self.valves = _newest(payload, "ValveStatus", self.valves)
+        for _, payload in self._statuses.take_all():
+            status = _newest(payload, "ProcessStatus", None)
+            if status is not None and status.process in self._source_names:
+                self.statuses[self._source_names[status.process]] = status
+        events = (_newest(payload, "Event", None) for _, payload in self._events.take_all())
+        return [self.event_line(event) for event in events if event is not None]
+
+    @property
+    def gate(self) -> int | None:
+        """The gate's state, None before its first word."""
+        return None if self.valves is None else self.valves.gate
+
+    @property
+    def armed(self) -> bool:
+        return self.gate == GATE_ARMED
+
+    @property
+    def reason(self) -> str:
+        """The gate's reason in words."""
+        return "unknown" if self.valves is None else reason_text(self.valves.reason)
+
+    @property
+    def done(self) -> bool:
+        """The controller says that its trajectory is over."""
+        return self.cycle is not None and self.cycle.phase == PHASE_DONE
+
+    def vented(self, vented_kpa: float) -> bool:
+        """The gate says that venting is over, or the chamber's pressure is gone."""
+        if self.valves is not None and self.valves.gate != GATE_ARMED and self.valves.output == OUTPUT_CLOSED:
+            return True
+        return self.pressure is not None and self.pressure.chamber_pressure_kpa < vented_kpa
+
+    def event_line(self, event: Any) -> str:
+        """An event in words, such as `valves: gate fault (sensor stale)`."""
+        who = self._source_names.get(event.source, "launcher")
+        return f"{who}: {_event_text(event)}"
+
+
+def reason_text(reason: int) -> str:
+    """A gate's reason in words: 3 -> `not finite`."""
+    return REASONS.get(reason, f"reason {reason}").replace("_", " ")
+
+
+def _event_text(event: Any) -> str:
+    kind = _KINDS.get(event.kind, f"event {event.kind}")
+    if kind == "gate":
+        return f"gate {GATES.get(event.code, event.code)} ({reason_text(event.reason)})"
+    if kind == "phase":
+        return f"phase {PHASES.get(event.code, event.code)}"
+    if kind == "load":
+        return f"{LOADS.get(event.reason, 'load')} {'came' if event.code else 'left'} ({event.value:g})"
+    if kind == "driver":
+        return f"valve driver {DRIVERS.get(event.code, event.code)}"
+    if kind == "bus":
+        return f"bus {'lost' if event.code else 'back'}"
+    return f"{kind}: {event.value:g}"
+
+
+def _newest(payload: bytes | None, name: str, before: Any) -> Any:
+    if payload is None:
+        return before
+    try:
+        return message(name).unpack(payload)
+    except BadPayload:
+        return before

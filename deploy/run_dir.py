@@ -1,0 +1,76 @@
+"""The run's directory and the lock that keeps a bench from running twice."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import gmtime, strftime
+
+import tomlkit
+
+from softloop.deploy.bench import Bench, Source
+from softloop.wire.config import runtime_dir
+from softloop.wire.errors import Unavailable
+
+BENCH_FILE = "bench.toml"
+
+
+def make_run_dir(bench: Bench, asked: Path | None) -> Path:
+    """The directory of a new run, made now: `asked`, or `<folder>/<bench>-<UTC time>`.
+
+    Raises:
+        Unavailable: it cannot be made, or it holds a run already.
+    """
+    path = asked or Path(bench.run.folder) / f"{bench.name}-{strftime('%Y%m%dT%H%M%SZ', gmtime())}"
+    if (path / BENCH_FILE).exists():
+        raise Unavailable(f"{path}: holds a run already; name another with --run-dir")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise Unavailable(f"{path}: cannot be made: {error.strerror or error}") from None
+    return path.resolve()
+
+
+def keep_bench(run_dir: Path, source: Source) -> Path:
+    """Write the bench, merged and with its texts substituted, into the run's directory; returns the file."""
+    file = run_dir / BENCH_FILE
+    file.write_text(tomlkit.dumps(source.content), encoding="utf-8")
+    return file
+
+
+@contextmanager
+def bench_lock(name: str) -> Iterator[None]:
+    """Held while a bench runs on this machine. Raises Unavailable when somebody else holds it, and says who."""
+    path = runtime_dir() / f"softloop-{name}.lock"
+    fd = _take(path, name)
+    try:
+        os.ftruncate(fd, 0)
+        os.write(fd, str(os.getpid()).encode())
+        yield
+    finally:
+        path.unlink(missing_ok=True)  # while it is held: whoever opened it before sees below that it is gone
+        os.close(fd)
+
+
+def _take(path: Path, name: str) -> int:
+    while True:
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.read(fd, 32).decode(errors="replace") or "unknown"
+            os.close(fd)
+            raise Unavailable(f"bench '{name}' is running already (launcher process {holder}); stop it first") from None
+        if _is_still(fd, path):
+            return fd
+        os.close(fd)
+
+
+def _is_still(fd: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(fd), path.stat())
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,80 @@
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import Field
+
+from softloop.wire.benchfile import Table, load_model, read_toml
+from softloop.wire.errors import BadConfig, BadFile
+
+
+class Inner(Table):
+    depth: int = Field(1, ge=0, le=9)
+
+
+class Outer(Table):
+    name: str
+    inner: Inner = Inner()
+    many: dict[str, Inner] = {}
+
+
+def fault(content):
+    with pytest.raises(BadConfig) as caught:
+        load_model(Outer, content, Path("b.toml"))
+    text = str(caught.value)
+    assert "\n" not in text
+    assert text.startswith("b.toml: ")
+    return text
+
+
+def test_an_unknown_key_is_named_with_what_is_allowed():
+    assert "unknown key 'nmae'; allowed here: inner, many, name" in fault({"name": "x", "nmae": 1})
+    assert "unknown key 'inner.dept'; allowed here: depth" in fault({"name": "x", "inner": {"dept": 1}})
+    assert "unknown key 'many.a.dept'; allowed here: depth" in fault({"name": "x", "many": {"a": {"dept": 1}}})
+
+
+def test_wrong_type_range_and_missing_key_are_named():
+    assert "key 'inner.depth'" in fault({"name": "x", "inner": {"depth": "deep"}})
+    assert "less than or equal to 9 (got 10)" in fault({"name": "x", "inner": {"depth": 10}})
+    assert "key 'name' is missing" in fault({})
+    assert "key 'inner'" in fault({"name": "x", "inner": 3})
+
+
+def test_files_that_are_missing_or_not_toml_are_one_line(tmp_path):
+    with pytest.raises(BadFile, match="cannot be read"):
+        read_toml(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("name = ")
+    with pytest.raises(BadFile, match="not valid TOML"):
+        read_toml(tmp_path / "bad.toml")
+    (tmp_path / "latin.toml").write_bytes(b"name = '\xe9'")
+    with pytest.raises(BadFile, match="not UTF-8"):
+        read_toml(tmp_path / "latin.toml")
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_give_a_model_or_one_line(tmp_path_factory, data):
+    file = tmp_path_factory.getbasetemp() / "fuzz.toml"
+    file.write_bytes(data)
+    try:
+        load_model(Outer, read_toml(file), file)
+    except (BadFile, BadConfig) as error:
+        assert str(file) in str(error)
+        assert "Traceback" not in str(error)
+
+
+JSONISH = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["name", "inner", "depth", "many", "x"]), inner),
+    max_leaves=8,
+)
+
+
+@given(st.dictionaries(st.sampled_from(["name", "inner", "many", "y"]), JSONISH))
+def test_any_content_gives_a_model_or_one_line(content):
+    try:
+        load_model(Outer, content, "b.toml")
+    except BadConfig as error:
+        assert str(error).startswith("b.toml: ")
+
+

@@ -1,0 +1,304 @@
+"""The recorder: every message of a bench into one MCAP file, and an account of what is missing.
+
+What it drops, it counts, by these rules:
+- backlog: more messages wait than `backlog_messages`: the oldest go;
+- storage: the disk has not taken `unwritten_mib` of finished bytes: new messages go until it takes them again. Nothing that
+  was written becomes invalid: the file goes on at the byte at which the disk refused;
+- malformed: a payload that is not the message of its channel is counted and not logged, because a log whose bytes do not fit
+  their schema cannot be read by others;
+- unknown: a key that is no channel of the table, or one that is not logged.
+The first two are events in the log; the first three stand in `ProcessStatus.dropped`. At the end `recorder.json` in the run's
+directory says it all.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from softloop.watch.config import RecorderConfig
+from softloop.wire.channels import CAN, EVENT, STATUS, Channel
+from softloop.wire.errors import Unavailable
+from softloop.wire.mcap_layout import BadMessage, LogWriter, attachments_of, logged_channel, read_origin, topic_of_key
+from softloop.wire.messages import constant, message
+from softloop.wire.session import Inbox
+from softloop.wire.shell import Context, say
+
+NAME = "recorder"
+ACCOUNT = "recorder.json"
+SOURCE = constant("Event", "SOURCE_RECORDER")
+KIND_BACKLOG = constant("Event", "KIND_BACKLOG")
+CODE_BACKLOG = 0  # Event.code with KIND_BACKLOG: the recorder did not keep up
+CODE_STORAGE = 1  # the disk took nothing
+STATUS_S = 1.0
+_STORE_BYTES = 1 << 20
+_RETRY_S = 0.1
+
+
+class Sink:
+    """A stream that takes everything into memory and gives it to the disk when the disk takes it.
+
+    A failing disk therefore never leaves half a record: what it refused stays here, and goes at the same offset later.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises Unavailable when the file cannot be made."""
+        try:
+            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise Unavailable(f"{path}: cannot be written: {error.strerror or error}") from None
+        self._waiting = bytearray()
+        self.stored = 0
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that the disk has not taken yet."""
+        return len(self._waiting)
+
+    def write(self, data: bytes) -> int:
+        self._waiting += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self.stored + len(self._waiting)
+
+    def flush(self) -> None:
+        """Nothing: bytes go to the disk by `store`, whose errors the recorder handles."""
+
+    def store(self) -> None:
+        """Give to the disk what waits. Raises OSError when it does not take all; the rest stays."""
+        while self._waiting:
+            taken = os.write(self._file, self._waiting[:_STORE_BYTES])
+            del self._waiting[:taken]
+            self.stored += taken
+
+    def close(self) -> None:
+        os.close(self._file)
+
+
+@dataclass
+class Sequence:
+    """What one sender's numbers on one topic (CAN: one bus) say about loss."""
+
+    first: int
+    last: int
+    messages: int = 1
+    missing: int = 0
+    backward: int = 0  # numbers at or below one seen before: repeated, out of order, or a sender that started anew
+
+    def note(self, seq: int) -> None:
+        self.messages += 1
+        self.missing += max(0, seq - self.last - 1)
+        self.backward += seq <= self.last
+        self.last = seq
+
+
+@dataclass
+class Account:
+    """What was logged and what was not."""
+
+    topics: dict[str, list[int]] = field(default_factory=dict)  # key -> [messages, payload bytes]
+    sequences: dict[tuple[str, int], Sequence] = field(default_factory=dict)  # (what the sender counts over, sender)
+    backlog: int = 0
+    storage: int = 0
+    malformed: int = 0
+    unknown: int = 0
+    storage_errors: list[str] = field(default_factory=list)
+
+    @property
+    def dropped(self) -> int:
+        return self.backlog + self.storage + self.malformed
+
+    def note(self, full_key: str, n_bytes: int, seq: int, sender: int) -> None:
+        count = self.topics.setdefault(full_key, [0, 0])
+        count[0] += 1
+        count[1] += n_bytes
+        name = (_counted_over(full_key), sender) if sender else (full_key, 0)
+        sequence = self.sequences.get(name)
+        if sequence is None:
+            self.sequences[name] = Sequence(seq, seq)
+        else:
+            sequence.note(seq)
+
+    def as_dict(self, stored: int, *, finished: bool) -> dict[str, Any]:
+        return {
+            "finished": finished,
+            "bytes_in_file": stored,
+            "messages": sum(count[0] for count in self.topics.values()),
+            "dropped_backlog": self.backlog,
+            "dropped_storage": self.storage,
+            "malformed": self.malformed,
+            "unknown_keys": self.unknown,
+            "storage_errors": self.storage_errors,
+            "channels": {topic_of_key(k): {"messages": c[0], "payload_bytes": c[1]} for k, c in sorted(self.topics.items())},
+            "sequences": [
+                {"topic": topic_of_key(k), "sender": sender, **vars(s)} for (k, sender), s in sorted(self.sequences.items())
+            ],
+        }
+
+
+def _counted_over(full_key: str) -> str:
+    """A CAN node counts its frames over all identifiers of a bus; other senders count on one key."""
+    parts = full_key.split("/")
+    return "/".join(parts[:-1]) if parts[2] == CAN.name else full_key
+
+
+class Recorder:
+    """The loop's state: what comes in, where it goes, and the account."""
+
+    def __init__(self, config: RecorderConfig, context: Context) -> None:
+        self.config = config
+        self.context = context
+        self.account = Account()
+        self.inbox: Inbox = context.wire.everything(config.backlog_messages)
+        self.sink = Sink(context.run_dir / config.file)
+        origin = read_origin(context.bench, context.clock.now_ns())
+        attachments = attachments_of(context.run_dir)
+        self.log = LogWriter(self.sink, origin, attachments, config.chunk_kib * 1024)
+        self._channels: dict[str, Channel | None] = {}
+        self._publish_event = context.wire.publisher(EVENT)
+        self._publish_status = context.wire.publisher(STATUS)
+        self._events = self._statuses = self._passes = 0
+        self._said_dropped = 0
+        self._refused = False
+        self._late_max_ns = 0
+        self.store()
+
+    def take(self) -> int:
+        """Write what has arrived; how many messages came."""
+        arrived = self.inbox.take_all()
+        full = self.sink.waiting > self.config.unwritten_mib << 20
+        for full_key, payload in arrived:
+            channel = self._channel(full_key)
+            if channel is None:
+                self.account.unknown += 1
+            elif full:
+                self.account.storage += 1
+            else:
+                self._write(full_key, channel, payload)
+        self.account.backlog = self.inbox.dropped
+        return len(arrived)
+
+    def _channel(self, full_key: str) -> Channel | None:
+        if full_key not in self._channels:
+            if len(self._channels) > 10_000:  # CAN identifiers make keys; strangers' keys must not eat the memory
+                self._channels.clear()
+            self._channels[full_key] = logged_channel(self.context.bench, full_key)
+        return self._channels[full_key]
+
+    def _write(self, full_key: str, channel: Channel, payload: bytes) -> None:
+        try:
+            seq, sender = self.log.add(full_key, channel, payload)
+        except BadMessage:
+            self.account.malformed += 1
+        else:
+            self.account.note(full_key, len(payload), seq, sender)
+
+    def flush(self) -> None:
+        """Close the chunk and give all to the disk; a disk that refuses is said once, and tried again next time."""
+        if self.sink.waiting <= self.config.unwritten_mib << 20:
+            self.log.flush()
+        self.store()
+
+    def store(self) -> None:
+        """Give what waits to the disk. Never raises."""
+        try:
+            self.sink.store()
+        except OSError as error:
+            if not self._refused:
+                self._refused = True
+                self._storage_lost(error.strerror or str(error))
+        else:
+            if self._refused:
+                self._refused = False
+                say(NAME, f"the disk takes the log again; {self.account.storage} messages are lost")
+
+    def _storage_lost(self, text: str) -> None:
+        self.account.storage_errors.append(text)
+        say(NAME, f"{self.config.file}: {text}; the run goes on, and up to {self.config.unwritten_mib} MiB wait for the disk")
+        self._event(CODE_STORAGE, self.account.storage)
+
+    def report(self) -> None:
+        """Once a second: drops as an event, and this process's status."""
+        lost = self.account.backlog + self.account.storage
+        if lost > self._said_dropped:
+            say(NAME, f"dropped {lost - self._said_dropped} messages")
+            self._said_dropped = lost
+            self._event(CODE_STORAGE if self._refused else CODE_BACKLOG, lost)
+        self._statuses += 1
+        kind = message("ProcessStatus")
+        status = kind.make(
+            seq=self._statuses,
+            stamp_ns=self.context.clock.now_ns(),
+            pid=os.getpid(),
+            cycles=self._passes,
+            dropped=self.account.dropped,
+            late_max_ns=self._late_max_ns,
+            process=SOURCE,
+            state=constant("ProcessStatus", "STATE_STOPPING" if self.context.stop else "STATE_RUNNING"),
+            realtime=int(self.context.realtime),
+        )
+        self._publish_status(kind.pack(status))
+        self._late_max_ns = 0
+
+    def _event(self, code: int, value: int) -> None:
+        self._events += 1
+        kind = message("Event")
+        now_ns = self.context.clock.now_ns()
+        made = kind.make(seq=self._events, stamp_ns=now_ns, value=float(value), source=SOURCE, kind=KIND_BACKLOG, code=code)
+        self._publish_event(kind.pack(made))
+
+    def keep_time(self, began_s: float) -> None:
+        """Wait for the next pass, and note by how much this one was longer than its period."""
+        self._passes += 1
+        late_s = time.monotonic() - began_s - self.config.poll_s
+        self._late_max_ns = max(self._late_max_ns, int(late_s * 1e9))
+        self.context.stop.wait(self.config.poll_s)
+
+    def finish(self) -> None:
+        """Write what is left, within `drain_s`, close the file and leave the account."""
+        end = time.monotonic() + self.config.drain_s
+        self.report()
+        time.sleep(self.config.poll_s)  # what others sent with their last breath is on its way
+        while self.take() and time.monotonic() < end:
+            pass
+        self.log.finish()
+        self.store()
+        while self.sink.waiting and time.monotonic() < end:
+            time.sleep(_RETRY_S)
+            self.store()
+        finished = self.sink.waiting == 0
+        self.sink.close()
+        self._leave_account(finished=finished)
+
+    def _leave_account(self, *, finished: bool) -> None:
+        text = json.dumps(self.account.as_dict(self.sink.stored, finished=finished), indent=2)
+        try:
+            (self.context.run_dir / ACCOUNT).write_text(text + "\n")
+        except OSError as error:
+            say(NAME, f"{ACCOUNT}: {error.strerror or error}")
+
+
+def run(config: RecorderConfig, context: Context) -> None:
+    """The recorder process. Raises Unavailable when the log cannot be begun; from then on nothing ends it but a stop.
+
+    Its own pace is the machine's, whatever clock the rig runs on: flushing is about what a killed process may cost.
+    """
+    recorder = Recorder(config, context)
+    context.enter_loop()
+    next_flush_s = next_report_s = time.monotonic()
+    while not context.stop:
+        now_s = time.monotonic()
+        recorder.take()
+        if now_s >= next_flush_s:
+            recorder.flush()
+            next_flush_s = now_s + config.flush_s
+        if now_s >= next_report_s:
+            recorder.report()
+            next_report_s = now_s + STATUS_S
+        recorder.keep_time(now_s)
+    recorder.finish()

@@ -1,0 +1,82 @@
+"""`[can.NAME]` of the bench file, and how an adapter opens and uses any CAN bus."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field, field_validator
+
+from softloop.wire.benchfile import Table
+from softloop.wire.clock import Clock
+from softloop.wire.errors import Unavailable
+from softloop.wire.session import Wire
+
+if TYPE_CHECKING:
+    import can
+
+    from softloop.wire.can_port import CanPort
+
+_OWN_KEYS = ("interface", "channel", "bitrate", "can_filters", "session", "bench")
+
+
+class CanConfig(Table):
+    """`[can.NAME]`: which bus. What is simulated or real differs here and nowhere else."""
+
+    interface: str = Field("zenoh", min_length=1, description="a python-can interface: zenoh, socketcan, slcan, pcan, ...")
+    channel: str | int = Field("can0", description="the bus of that interface: can0, /dev/ttyACM0, PCAN_USBBUS1, ...")
+    bitrate: int = Field(500_000, ge=10_000, le=1_000_000, description="bit/s")
+    send_timeout_ms: float = Field(2.0, gt=0, le=1000, description="a frame the bus has not taken by then is given up")
+    mirror: bool = Field(True, description="also publish the frames of a bus that is not on Zenoh, for the log")
+    options: dict[str, Any] = Field(default_factory=dict, description="more arguments of the python-can interface")
+
+    @field_validator("options")
+    @classmethod
+    def _leaves_own_keys_alone(cls, value: dict[str, Any]) -> dict[str, Any]:
+        taken = sorted(set(value) & set(_OWN_KEYS))
+        if taken:
+            raise ValueError(f"{', '.join(taken)} cannot stand in options")
+        return value
+
+
+def open_bus(config: CanConfig, wire: Wire, receive: Sequence[int] | None = None) -> can.BusABC:
+    """Open the bus that `config` names.
+
+    Args:
+        receive: the standard arbitration ids to receive; None for all frames. Error frames come in any case.
+
+    Raises:
+        Unavailable: one line that says why there is no such bus, and which interfaces there are.
+    """
+    import can
+
+    import softloop.wire.serial_urls  # noqa: F401 - a serial adapter's channel may be one of our URLs
+
+    arguments: dict[str, Any] = dict(config.options)
+    if config.interface == "zenoh":
+        arguments |= {"session": wire.session, "bench": wire.bench}
+    if receive is not None:
+        arguments["can_filters"] = [{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in receive]
+    # Only what the bench file says: python-can's own configuration files and variables are left out.
+    arguments |= {"interface": config.interface, "channel": config.channel, "bitrate": config.bitrate, "ignore_config": True}
+    if config.interface not in can.VALID_INTERFACES:
+        there = ", ".join(sorted(can.VALID_INTERFACES))
+        raise Unavailable(f"CAN interface '{config.interface}' is not known; there are: {there}")
+    try:
+        return can.Bus(**arguments)
+    except Exception as error:  # noqa: BLE001 - each driver has errors of its own kind; a person gets one line
+        raise Unavailable(f"CAN bus {config.interface}:{config.channel}: {one_line(error)}") from None
+
+
+def open_port(config: CanConfig, name: str, wire: Wire, clock: Clock, receive: Sequence[int] | None = None) -> CanPort:
+    """Open the bus of table `[can.NAME]` as an adapter uses it. Arguments and errors as `open_bus`."""
+    from softloop.wire.can_port import CanPort
+
+    bus = open_bus(config, wire, receive)
+    return CanPort(bus, name, wire, clock, send_timeout_s=config.send_timeout_ms * 1e-3, mirror=config.mirror)
+
+
+def one_line(error: BaseException) -> str:
+    """What an error says, in one line; its kind where it says nothing."""
+    lines = str(error).strip().splitlines()
+    return lines[0][:200] if lines else type(error).__name__
