@@ -8,6 +8,7 @@ time since its knot; for sines a row (amplitude, frequency in rad/s, phase) per 
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from math import cos, pi, sin
 from pathlib import Path
@@ -170,7 +171,8 @@ def excitation(top_hz: float, seed: int, span_kpa: tuple[float, float] = EXCITAT
 def from_csv(path: Path) -> Plan:
     """A spline of degree seven through the rows `t_s, value` of a CSV file. Raises BadFile."""
     try:
-        rows = np.atleast_2d(np.genfromtxt(path, delimiter=",", skip_header=1, usecols=(0, 1)))
+        with warnings.catch_warnings(action="ignore"):  # an empty file: said below in one line
+            rows = np.atleast_2d(np.genfromtxt(path, delimiter=",", skip_header=1, usecols=(0, 1)))
     except (OSError, ValueError) as error:
         raise BadFile(f"{path}: not a reference file with a header and columns t_s, value: {error}") from None
     if len(rows) < 8 or not np.all(np.isfinite(rows)) or not np.all(np.diff(rows[:, 0]) > 0):

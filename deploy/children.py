@@ -15,6 +15,7 @@ from softloop.wire.errors import EXIT_LOST
 
 TAIL_BYTES = 4096
 POLL_S = 0.01
+PROGRAM = (sys.executable, "-m", "softloop.deploy.cli")
 
 
 @dataclass
@@ -71,13 +72,14 @@ class Children:
     sees the end of the pipe, vents and exits. Each has a session of its own, so that Ctrl-C reaches the launcher alone.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, program: Sequence[str] = PROGRAM) -> None:
+        self._program = program
         self._read_end, self._write_end = os.pipe()
         self.all: dict[str, Child] = {}
 
     def start(self, name: str, arguments: Sequence[str], log: Path) -> Child:
-        """Start `python -m softloop.deploy.cli ARGUMENTS --lifeline-fd N`."""
-        command = [sys.executable, "-m", "softloop.deploy.cli", *arguments, "--lifeline-fd", str(self._read_end)]
+        """Start `PROGRAM ARGUMENTS --lifeline-fd N`."""
+        command = [*self._program, *arguments, "--lifeline-fd", str(self._read_end)]
         with log.open("wb") as output:
             popen = subprocess.Popen(
                 command,

@@ -7,16 +7,19 @@ import time
 from collections.abc import Callable
 from typing import Literal
 
-from softloop.deploy.rig_state import GATE_ARMED, GATE_DISARMED, GATE_FAULT, RigState
+from softloop.deploy.bench import Bench
+from softloop.deploy.rig_state import GATE_ARMED, GATE_DISARMED, GATE_FAULT, GATES, RigState
 from softloop.wire.channels import REQUEST
+from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, Unavailable
 from softloop.wire.messages import constant, message
-from softloop.wire.session import Wire
+from softloop.wire.session import Wire, open_wire
 
 Action = Literal["arm", "disarm", "stop"]
 WANTED = {"arm": GATE_ARMED, "disarm": GATE_DISARMED, "stop": GATE_FAULT}
 # A request can be lost (nothing on the wires waits), so it is said again until the gate is where it should be.
 REPEAT_NS = 200_000_000
 POLL_S = 0.02
+FIND_GATE_S = 3.0  # a gate speaks every 5 ms; joining takes well under a second
 
 
 class Requests:
@@ -64,3 +67,29 @@ def ask(
             sends, sent_ns = sends + 1, time.monotonic_ns()
         time.sleep(POLL_S)
     return False
+
+
+def request_once(bench: Bench, action: Action, timeout_s: float) -> int:
+    """`softloop request`: ask, and print the gate's answer; returns the exit code.
+
+    Raises:
+        Unavailable: no gate is running on this bench.
+    """
+    with open_wire(bench.zenoh, bench.name, f"request-{action}") as wire:
+        state = RigState(wire)
+        requests = Requests(wire)
+        _wait_for_gate(bench, state, min(timeout_s, FIND_GATE_S))
+        obeyed = ask(requests, state, action, timeout_s)
+    said = f"gate {GATES.get(state.gate or 0, '?')}" + ("" if state.reason == "none" else f" ({state.reason})")
+    print(said if obeyed else f"refused: {said}", flush=True)
+    return EXIT_OK if obeyed else EXIT_NEGATIVE
+
+
+def _wait_for_gate(bench: Bench, state: RigState, timeout_s: float) -> None:
+    deadline = time.monotonic() + timeout_s
+    while state.gate is None:
+        if time.monotonic() >= deadline:
+            where = bench.zenoh.meeting_point(bench.name)
+            raise Unavailable(f"no gate of bench '{bench.name}' is heard at {where}; is it running?")
+        time.sleep(POLL_S)
+        state.refresh()

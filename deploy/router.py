@@ -8,9 +8,11 @@ from pathlib import Path
 
 from softloop.deploy.bench import Bench
 from softloop.wire.errors import Unavailable
-from softloop.wire.session import UNIX, Wire, open_router, open_session, own_endpoint
+from softloop.wire.session import UNIX, Wire, open_router, open_session
+from softloop.wire.shell import Stop
 
 LAUNCHER = "launcher"
+POLL_S = 0.2
 
 
 @contextmanager
@@ -32,9 +34,18 @@ def launcher_wire(bench: Bench) -> Iterator[Wire]:
         yield wire
 
 
-def remove_sockets(bench: Bench, process: str, pid: int) -> None:
-    """Remove what a process that was killed left of its own Zenoh socket."""
-    own = own_endpoint(bench.zenoh.meeting_point(bench.name), process, pid)
-    if own.startswith(UNIX):
-        for end in ("", ".lock"):
-            Path(own[len(UNIX) :] + end).unlink(missing_ok=True)
+def remove_sockets(bench: Bench, pid: int) -> None:
+    """Remove the Zenoh sockets that a process that was killed left beside the meeting point."""
+    meet = bench.zenoh.meeting_point(bench.name)
+    if meet.startswith(UNIX):
+        path = Path(meet[len(UNIX) :])
+        for left in path.parent.glob(f"{path.stem}.*.{pid}.sock*"):
+            left.unlink(missing_ok=True)
+
+
+def run_router(bench: Bench, stop: Stop) -> None:
+    """Be the meeting point until asked to stop. Raises Unavailable when the address is in use."""
+    with open_router(bench.zenoh, bench.name):
+        print(f"meeting point of bench '{bench.name}': {bench.zenoh.meeting_point(bench.name)}", flush=True)
+        while not stop.wait(POLL_S):
+            pass

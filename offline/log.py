@@ -135,7 +135,8 @@ def open_log(path: Path | str) -> Log:
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
                 raise BadFile(f"{path}: not an MCAP file")
-        return _Reader(path).read(memoryview(np.memmap(path, np.uint8, "r")))
+        content: Any = np.memmap(path, np.uint8, "r")
+        return _Reader(path).read(memoryview(content))
     except OSError as error:
         raise BadFile(f"{path}: cannot be read: {error.strerror or error}") from None
 
@@ -360,14 +361,15 @@ def _parse(name: str, text: str) -> MessageType:
 
 def _as_records(kind: MessageType, blocks: list[Bytes]) -> tuple[Records, int]:
     """Blocks of payloads as one array of `kind.dtype`, and how many payloads were not of its size or encoding."""
-    header = np.frombuffer(CDR_HEADER, np.uint8)
+    header = np.frombuffer(CDR_HEADER, "<u4")[0]
     good = [b for b in blocks if b.shape[1] == kind.size]
     total = sum(len(b) for b in blocks)
     records = np.zeros(sum(len(b) for b in good), kind.dtype)
     rows = records.view(np.uint8).reshape(len(records), kind.dtype.itemsize) if len(records) else np.zeros((0, 0), np.uint8)
     at = 0
     for block in good:
-        fitting = block[(block[:, :4] == header).all(axis=1)]
+        headers = np.ascontiguousarray(block[:, :4]).view("<u4")[:, 0]
+        fitting = block if (headers == header).all() else block[headers == header]
         rows[at : at + len(fitting), : kind.cdr_size] = fitting[:, 4:]
         at += len(fitting)
     return records[:at], total - at

@@ -51,23 +51,6 @@ def static_air_slopes(air: Any, state: Any, charge_ma: float, exhaust_ma: float)
 
 
 @kernel(types.void(AIR_TYPE, STATE_TYPE, _F8, _F8))
-def rig_air_slopes(air: Any, state: Any, charge_ma: float, exhaust_ma: float) -> None:
-    """The rig layer: writes the slopes of spools, supply, tube, chamber and gas temperature."""
-    x, slope = state.stage, state.slope
-    supply, block = x[SUPPLY], x[TUBE]
-    into, out = valve_flows(air, supply, block, min(x[AREA_IN], air.charge.area_max_m2), min(x[AREA_OUT], air.exhaust.area_max_m2))
-    block_pa = PA_PER_KPA * block + ATMOSPHERE_PA
-    chamber_pa = PA_PER_KPA * x[CHAMBER] + ATMOSPHERE_PA
-    line = air.tube_kg_s_pa2 * (block_pa - chamber_pa) * (block_pa + chamber_pa)
-    slope[SUPPLY] = (air.supply_kpa - air.supply_droop_kpa_s_kg * into - supply) * air.supply_rate
-    slope[TUBE] = GAS_CONSTANT * air.wall_k / (PA_PER_KPA * air.tube_volume_m3) * (into - out - line)
-    _chamber_slopes(air, state, chamber_pa, line)
-    supply_pa, block_gauge_pa = PA_PER_KPA * supply, PA_PER_KPA * block
-    _spool_slopes(air, air.charge, state, AREA_IN, air.k_v1_charge * charge_ma - air.k_v6_charge, supply_pa, block_gauge_pa)
-    _spool_slopes(air, air.exhaust, state, AREA_OUT, air.k_v1_exhaust * exhaust_ma - air.k_v6_exhaust, block_gauge_pa, 0.0)
-
-
-@kernel(types.void(AIR_TYPE, STATE_TYPE, _F8, _F8))
 def _chamber_slopes(air: Any, state: Any, chamber_pa: float, line_kg_s: float) -> None:
     """First law for the gas in a chamber that grows as it bends, with heat from its wall."""
     x, slope = state.stage, state.slope
@@ -97,6 +80,23 @@ def _spool_slopes(
         speed, push = 0.0, 0.0
     state.slope[place] = speed
     state.slope[place + 1] = push
+
+
+@kernel(types.void(AIR_TYPE, STATE_TYPE, _F8, _F8))
+def rig_air_slopes(air: Any, state: Any, charge_ma: float, exhaust_ma: float) -> None:
+    """The rig layer: writes the slopes of spools, supply, tube, chamber and gas temperature."""
+    x, slope = state.stage, state.slope
+    supply, block = x[SUPPLY], x[TUBE]
+    into, out = valve_flows(air, supply, block, min(x[AREA_IN], air.charge.area_max_m2), min(x[AREA_OUT], air.exhaust.area_max_m2))
+    block_pa = PA_PER_KPA * block + ATMOSPHERE_PA
+    chamber_pa = PA_PER_KPA * x[CHAMBER] + ATMOSPHERE_PA
+    line = air.tube_kg_s_pa2 * (block_pa - chamber_pa) * (block_pa + chamber_pa)
+    slope[SUPPLY] = (air.supply_kpa - air.supply_droop_kpa_s_kg * into - supply) * air.supply_rate
+    slope[TUBE] = GAS_CONSTANT * air.wall_k / (PA_PER_KPA * air.tube_volume_m3) * (into - out - line)
+    _chamber_slopes(air, state, chamber_pa, line)
+    supply_pa, block_gauge_pa = PA_PER_KPA * supply, PA_PER_KPA * block
+    _spool_slopes(air, air.charge, state, AREA_IN, air.k_v1_charge * charge_ma - air.k_v6_charge, supply_pa, block_gauge_pa)
+    _spool_slopes(air, air.exhaust, state, AREA_OUT, air.k_v1_exhaust * exhaust_ma - air.k_v6_exhaust, block_gauge_pa, 0.0)
 
 
 @kernel(types.void(VALVE_SHAPE_TYPE, STATE_TYPE, types.i8))

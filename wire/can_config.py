@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field, field_validator
 
 from softloop.wire.benchfile import Table
-from softloop.wire.clock import Clock
 from softloop.wire.errors import Unavailable
-from softloop.wire.session import Wire
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # reading a bench file needs none of these
     import can
 
     from softloop.wire.can_port import CanPort
+    from softloop.wire.clock import Clock
+    from softloop.wire.session import Wire
 
 _OWN_KEYS = ("interface", "channel", "bitrate", "can_filters", "session", "bench")
 
@@ -48,9 +48,9 @@ def open_bus(config: CanConfig, wire: Wire, receive: Sequence[int] | None = None
     Raises:
         Unavailable: one line that says why there is no such bus, and which interfaces there are.
     """
-    import can
+    import can  # noqa: PLC0415 - a bench file is read by many who need no bus
 
-    import softloop.wire.serial_urls  # noqa: F401 - a serial adapter's channel may be one of our URLs
+    import softloop.wire.serial_urls  # noqa: F401, PLC0415 - a serial adapter's channel may be one of our URLs
 
     arguments: dict[str, Any] = dict(config.options)
     if config.interface == "zenoh":
@@ -70,7 +70,7 @@ def open_bus(config: CanConfig, wire: Wire, receive: Sequence[int] | None = None
 
 def open_port(config: CanConfig, name: str, wire: Wire, clock: Clock, receive: Sequence[int] | None = None) -> CanPort:
     """Open the bus of table `[can.NAME]` as an adapter uses it. Arguments and errors as `open_bus`."""
-    from softloop.wire.can_port import CanPort
+    from softloop.wire.can_port import CanPort  # noqa: PLC0415 - as in open_bus
 
     bus = open_bus(config, wire, receive)
     return CanPort(bus, name, wire, clock, send_timeout_s=config.send_timeout_ms * 1e-3, mirror=config.mirror)

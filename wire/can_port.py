@@ -31,6 +31,7 @@ from softloop.wire.errors import Lost
 from softloop.wire.session import Wire
 
 _MOST_NOISE_AT_ONCE = 64
+_ONLY_NOISE = 256  # faults in reading, with no frame between them: not a bad line any more, but a dead one
 _CLOSE_WITHIN_S = 2.0
 _DOWN = {errno.ENETDOWN, errno.ENETUNREACH}
 _FULL = {errno.ENOBUFS, errno.EAGAIN, errno.ETIMEDOUT}
@@ -58,6 +59,7 @@ class CanPort:
         self._mirror = FramePublisher(wire.session, wire.bench, name) if mirror and self._zenoh is None else None
         self._node = random_node()
         self._seq = 0
+        self._noise_run = 0
         self._state = can.BusState.ACTIVE
         self._fd = _descriptor(bus)
 
@@ -124,8 +126,9 @@ class CanPort:
         try:
             return self.bus.recv(timeout=timeout_s)
         except Exception as error:  # noqa: BLE001 - drivers raise what they like; it is sorted here
-            if _is_noise(error):
+            if _is_noise(error) and self._noise_run < _ONLY_NOISE:
                 self.malformed_lines += 1
+                self._noise_run += 1
                 with contextlib.suppress(Exception):
                     getattr(self.bus, "flush", lambda: None)()  # slcan keeps the bytes it could not decode
             elif _number(error) in _DOWN:
@@ -150,6 +153,7 @@ class CanPort:
             self.malformed_lines += 1
             return None
         self._seq += 1
+        self._noise_run = 0
         self._note(frame)
         if msg.is_rx:  # what this port sent was published then
             self._publish(frame)

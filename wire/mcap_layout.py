@@ -117,9 +117,7 @@ class LogWriter:
     Not thread-safe; errors of the stream pass through.
     """
 
-    def __init__(
-        self, stream: Any, origin: Origin, attachments: Mapping[str, bytes], chunk_bytes: int = CHUNK_BYTES
-    ) -> None:
+    def __init__(self, stream: Any, origin: Origin, attachments: Mapping[str, bytes], chunk_bytes: int = CHUNK_BYTES) -> None:
         self.origin = origin
         self._lanes: dict[str, _Lane] = {}
         self._schemas: dict[str, int] = {}

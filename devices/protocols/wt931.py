@@ -2,17 +2,21 @@
 
 Packets are 11 bytes: 0x55, a type, eight data bytes, the low byte of the sum of the ten before. Nothing marks a start for
 certain, and the sum lets one false packet in about 2e4 accepted ones through where bytes are lost, so a packet is believed
-only when it continues what is known (`plausible_step`). Source: WitMotion's C SDK and protocol sheets.
+only when it continues what is known (`sample_step`). Source: WitMotion's C SDK and protocol sheets.
 
-The functions over records are plain Python without numba and compile as they are (`wt931_kernels`).
+`sample_step` is plain Python without numba and compiles as it is (`wt931_kernels`).
 """
 
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from softloop.devices.protocols.quantise import ANGLE_FULL_DEG, INT16_FULL, RATE_FULL_DEG_S
+from softloop.devices.protocols.wire_time import serial_ns
 
 HEAD = 0x55
 PACKET_BYTES = 11
@@ -148,105 +152,163 @@ def settings(rate_hz: int, baud: int, bandwidth_hz: int) -> list[tuple[int, int]
 CONFIRMATIONS = 3
 """So many packets in a row that agree with each other are believed against what was known before. Hence, whatever happened,
 the third good packet after it is a sample again, and nothing locks the gate for good."""
+NOTHING, SAMPLE, SAMPLE_WITHOUT_RATE = 0, 1, 2
+
+
+@dataclass
+class SamplerConfig:
+    """Bounds of `sample_step`. Lists: 0 gyro, 1 angle."""
+
+    period_ns: int  # of the device; a shorter time between two stamps is taken as this
+    slope_counts_s: list[float]  # how fast the value can change
+    noise_counts: list[float]
+
+
+@dataclass
+class SamplerState:
+    """What `sample_step` knows. Lists: the gyro packet last believed, the newest one refused, then the same of the angle."""
+
+    count: list[int] = field(default_factory=lambda: [0] * 4)  # 1 once known; refused in a row that agree with each other
+    value: list[int] = field(default_factory=lambda: [0] * 4)
+    tag: list[int] = field(default_factory=lambda: [0] * 4)  # the version word of angle packets: constant in one device
+    stamp_ns: list[int] = field(default_factory=lambda: [0] * 4)
+    started: int = 0
+    turned: int = 0  # unwrapped angle, counts
+    rate: int = 0  # last rate believed, counts
+    rejected: int = 0  # packets refused as implausible
 
 
 def _record(fields: list[Any]) -> np.dtype[Any]:
     return np.dtype((np.record, np.dtype(fields, align=True)))
 
 
-PLAUSIBLE = _record([
-    ("known", np.int64),        # 1 when value, tag and stamp_ns hold an accepted packet
-    ("value", np.int64),
-    ("tag", np.int64),
-    ("stamp_ns", np.int64),
-    ("candidates", np.int64),   # refused packets in a row that agree with each other; the newest of them:
-    ("candidate", np.int64),
-    ("candidate_tag", np.int64),
-    ("candidate_stamp_ns", np.int64),
-])  # fmt: skip
-"""What is known of one stream of int16 values."""
-
-SAMPLER_CONFIG = _record([
-    ("period_ns", np.int64),                # of the device; a shorter time between stamps is taken as this
-    ("angle_counts_s", np.float64),         # how fast the angle can change
-    ("angle_noise_counts", np.float64),
-    ("gyro_counts_s", np.float64),          # how fast the rate can change
-    ("gyro_noise_counts", np.float64),
-])  # fmt: skip
-
-SAMPLER_STATE = _record([
-    ("angle", PLAUSIBLE),
-    ("gyro", PLAUSIBLE),
-    ("turned", np.int64),                   # unwrapped angle, counts
-    ("started", np.int64),
-    ("rate", np.int64),                     # last rate believed, counts
-    ("rejected", np.int64),                 # packets refused as implausible
-])  # fmt: skip
+_I8, _F8 = np.int64, np.float64
+SAMPLER_CONFIG = _record([("period_ns", _I8), ("slope_counts_s", _F8, (2,)), ("noise_counts", _F8, (2,))])
+SAMPLER_STATE = _record(
+    [(name, _I8, (4,)) for name in ("count", "value", "tag", "stamp_ns")]
+    + [(name, _I8) for name in ("started", "turned", "rate", "rejected")]
+)
 
 
-def new_state(dtype: np.dtype[Any]) -> Any:
-    """One zeroed record, writable in place."""
-    return np.zeros(1, dtype)[0]
+def as_record(source: SamplerConfig | SamplerState, dtype: np.dtype[Any]) -> Any:
+    """The same as a record (SAMPLER_CONFIG, SAMPLER_STATE), for the compiled `sample_step`."""
+    record = np.zeros(1, dtype)[0]
+    for name in dtype.names or ():
+        record[name] = getattr(source, name)
+    return record
 
 
-def sampler_config(rate_hz: float, max_rate_deg_s: float, noise_deg: float, max_acceleration_deg_s2: float, noise_deg_s: float) -> Any:
-    """A SAMPLER_CONFIG record from bounds in degrees."""
-    config = new_state(SAMPLER_CONFIG)
-    config.period_ns = round(1e9 / rate_hz)
-    config.angle_counts_s = max_rate_deg_s * 32768.0 / 180.0
-    config.angle_noise_counts = noise_deg * 32768.0 / 180.0
-    config.gyro_counts_s = max_acceleration_deg_s2 * 32768.0 / 2000.0
-    config.gyro_noise_counts = noise_deg_s * 32768.0 / 2000.0
-    return config
+def sampler_config(
+    rate_hz: float, max_rate_deg_s: float, noise_deg: float, max_acceleration_deg_s2: float, noise_deg_s: float
+) -> SamplerConfig:
+    """Bounds on rate and acceleration, and what noise may add to one step of angle and rate."""
+    return SamplerConfig(
+        round(1e9 / rate_hz),
+        [max_acceleration_deg_s2 * INT16_FULL / RATE_FULL_DEG_S, max_rate_deg_s * INT16_FULL / ANGLE_FULL_DEG],
+        [noise_deg_s * INT16_FULL / RATE_FULL_DEG_S, noise_deg * INT16_FULL / ANGLE_FULL_DEG],
+    )
 
 
-def wrapped(counts: int) -> int:
-    """A difference of angles brought into -32768..32767: the short way round."""
-    return (counts + 32768) % 65536 - 32768
+def sample_step(config: Any, state: Any, has_gyro: int, gyro: int, angle: int, version: int, stamp_ns: int) -> int:
+    """One angle packet and the gyro packet before it, if there was one -> NOTHING, SAMPLE or SAMPLE_WITHOUT_RATE.
+
+    `gyro` and `angle` are int16 counts; `state` then holds the unwrapped angle in `turned`, and `rate`. A value is believed
+    when its tag is the known one and it differs from the last one believed by at most slope times time and noise; or when it
+    is the third of CONFIRMATIONS that agree so with each other. Takes the two records or the two dataclasses.
+    """
+    before = state.value[2]
+    believed = 0
+    for i in range(1 - has_gyro, 2):
+        value, tag = (gyro, 0) if i == 0 else (angle, version)
+        known, refused = 2 * i, 2 * i + 1
+        near = 0
+        for k in range(known, refused + 1):
+            change = value - state.value[k]
+            if i == 1:
+                change = (change + 32768) % 65536 - 32768  # the short way round
+            time_s = max(stamp_ns - state.stamp_ns[k], config.period_ns) * 1e-9
+            if state.count[k] > 0 and state.tag[k] == tag:
+                near += (k - known + 1) * (abs(change) <= config.slope_counts_s[i] * time_s + config.noise_counts[i])
+        agreeing = state.count[refused] + 1 if near >= 2 else 1
+        keep = known if near % 2 == 1 or agreeing >= CONFIRMATIONS else refused
+        state.count[refused] = agreeing if keep == refused else 0
+        state.count[keep] = 1 if keep == known else agreeing
+        state.value[keep] = value
+        state.tag[keep] = tag
+        state.stamp_ns[keep] = stamp_ns
+        state.rejected += keep == refused
+        believed += (1 + i) * (keep == known)
+    if believed == 1 or believed == 3:
+        state.rate = gyro
+    if believed < 2:
+        return NOTHING
+    turn = (angle - before + 32768) % 65536 - 32768
+    state.turned = state.turned + turn if state.started == 1 else angle
+    state.started = 1
+    return SAMPLE if believed == 3 else SAMPLE_WITHOUT_RATE
 
 
-def make_plausible_step(wrap: Any) -> Any:
-    """Bind `plausible_step` to the callee it uses: plain here, compiled in `wt931_kernels`."""
+class Sample(NamedTuple):
+    """One measurement, in counts; `stamp_ns` is when the device began to send it."""
 
-    def plausible_step(
-        state: Any, value: int, tag: int, stamp_ns: int, turning: int, slope_s: float, noise: float, period_ns: int
-    ) -> int:
-        """1 when a value is to be believed. `state` is PLAUSIBLE, `turning` is 1 for angles, `slope_s` counts per second.
-
-        A value is believed when it differs from the last believed one by no more than slope times time and noise, and its
-        tag (the version word of angle packets) is the same; else it becomes, or confirms, a candidate.
-        """
-        if state.known == 1 and tag == state.tag:
-            change = value - state.value
-            if turning == 1:
-                change = wrap(change)
-            if abs(change) <= slope_s * 1e-9 * max(stamp_ns - state.stamp_ns, period_ns) + noise:
-                state.value = value
-                state.stamp_ns = stamp_ns
-                state.candidates = 0
-                return 1
-        agrees = 0
-        if state.candidates > 0 and tag == state.candidate_tag:
-            change = value - state.candidate
-            if turning == 1:
-                change = wrap(change)
-            if abs(change) <= slope_s * 1e-9 * max(stamp_ns - state.candidate_stamp_ns, period_ns) + noise:
-                agrees = 1
-        state.candidates = state.candidates + 1 if agrees == 1 else 1
-        state.candidate = value
-        state.candidate_tag = tag
-        state.candidate_stamp_ns = stamp_ns
-        if state.candidates < 3:
-            return 0
-        state.known = 1
-        state.value = value
-        state.tag = tag
-        state.stamp_ns = stamp_ns
-        state.candidates = 0
-        return 1
-
-    return plausible_step
+    kind: int
+    angle_counts: int
+    rate_counts: int
+    stamp_ns: int
+    received_ns: int
 
 
-def make_sample_step(wrap: Any, plausible: Any) -> Any:
-    """Bind `sample_step` to the callees it uses."""
+class Sampler:
+    """Bytes to samples: `Parser`, pairing, `sample_step`.
+
+    A gyro packet belongs to the angle packet that follows it in the stream with no byte between. A packet or a pair whose
+    parts came in different bursts is refused: a lost sum byte can be replaced by the next packet's head (0x55), and a loss of
+    exactly 22 bytes joins a gyro packet to the next sample's angle.
+    """
+
+    def __init__(self, config: SamplerConfig, baud: int) -> None:
+        self.parser = Parser()
+        self.registers: list[tuple[int, int, int, int]] = []  # what register reads brought, oldest first
+        self._config = config
+        self._baud = baud
+        self._pause_ns = max(0, config.period_ns - serial_ns(SAMPLE_BYTES, baud)) // 2  # half the line's rest between bursts
+        self._state = SamplerState()
+        self._gyro: Packet | None = None
+        self._gyro_end_ns = 0
+        self._torn = 0
+        self._arrival_ns = 0
+
+    @property
+    def rejected(self) -> int:
+        """Packets thrown away in total: wrong sum, torn between two bursts, implausible."""
+        return self.parser.bad_sum + self._torn + self._state.rejected
+
+    def feed(self, data: bytes, arrival_ns: int) -> list[Sample]:
+        """The samples complete with `data`, whose last byte came at `arrival_ns`; earlier bytes came by the baud rate before."""
+        found: list[Sample] = []
+        before, before_ns = self.parser.taken, self._arrival_ns
+        self._arrival_ns = arrival_ns
+        for packet in self.parser.feed(data):
+            end_ns = arrival_ns - serial_ns(self.parser.taken - packet.end, self._baud)
+            began_before = packet.end - PACKET_BYTES < before
+            if began_before and end_ns - before_ns > serial_ns(packet.end - before, self._baud) + self._pause_ns:
+                self._torn += 1
+            elif packet.kind == GYRO:
+                self._gyro, self._gyro_end_ns = packet, end_ns
+            elif packet.kind == ANGLE:
+                sample = self._measure(packet, end_ns, arrival_ns)
+                found.extend([sample] if sample else [])
+            else:
+                self.registers.append(packet.words)
+        return found
+
+    def _measure(self, packet: Packet, end_ns: int, arrival_ns: int) -> Sample | None:
+        gyro, self._gyro = self._gyro, None
+        near = end_ns - self._gyro_end_ns <= serial_ns(PACKET_BYTES, self._baud) + self._pause_ns
+        paired = gyro is not None and gyro.end + PACKET_BYTES == packet.end and near
+        rate = gyro.words[0] if gyro is not None and paired else 0
+        stamp_ns = end_ns - serial_ns(SAMPLE_BYTES, self._baud)
+        kind = sample_step(self._config, self._state, int(paired), rate, packet.words[0], packet.words[3], stamp_ns)
+        if kind == NOTHING:
+            return None
+        return Sample(kind, self._state.turned, self._state.rate, stamp_ns, arrival_ns)

@@ -11,7 +11,7 @@ import numpy as np
 
 from softloop.wire.channels import CAN, CHANNELS, can_key, key
 from softloop.wire.mcap_layout import LogWriter, Origin
-from softloop.wire.messages import constant, message
+from softloop.wire.messages import message
 
 BENCH = "synthetic"
 MS = 1_000_000
@@ -20,7 +20,10 @@ START_CLOCK_NS = 1_000_000_000_000
 START_WALL_NS = 1_760_000_000_000_000_000
 ORIGIN = Origin(BENCH, START_WALL_NS, START_CLOCK_NS)
 BENCH_TOML = b'name = "synthetic"\n\n[controller]\nlaw = "arc"\n'
+GIT = b'{"commit": "abc", "dirty": false}\n'
 BY_NAME = {c.name: c for c in CHANNELS}
+
+THETA = tuple(float(k) for k in range(14))
 
 # The hops of every sample and command, in ns after the tick they belong to (negative: before it).
 HOPS_NS = {
@@ -92,9 +95,13 @@ def _tick(i: int, y: float, rate: float, error: float, can: bool) -> Iterator[tu
     charge, exhaust = (90.0 + rate, 0.0) if rate > 0 else (0.0, 90.0 - rate) if rate < 0 else (0.0, 0.0)
     mode = 1 if rate > 0 else 2 if rate < 0 else 3
     pressure = (y - 26.75) * 0.85
-    truth = dict(seq=i + 1, stamp_ns=t - MS, angle_deg=y + error, rate_deg_s=rate, chamber_pressure_kpa=pressure)
-    truth |= dict(supply_pressure_kpa=200.0, charge_coil_ma=charge, exhaust_coil_ma=exhaust, command_counter=max(0, i))
-    truth |= dict(command_end_ns=h["frame_end"] - PERIOD_NS, command_applied_ns=h["applied"] - PERIOD_NS, late_max_ns=300_000)
+    truth = {"seq": i + 1, "stamp_ns": t - MS, "angle_deg": y + error, "rate_deg_s": rate, "chamber_pressure_kpa": pressure}
+    truth |= {"supply_pressure_kpa": 200.0, "charge_coil_ma": charge, "exhaust_coil_ma": exhaust, "command_counter": max(0, i)}
+    truth |= {
+        "command_end_ns": h["frame_end"] - PERIOD_NS,
+        "command_applied_ns": h["applied"] - PERIOD_NS,
+        "late_max_ns": 300_000,
+    }
     yield _of("truth", **truth)
     stamps = {k: h[f"pressure_{v}"] for k, v in (("stamp_ns", "sampled"), ("received_ns", "received"))}
     stamps["published_ns"] = h["pressure_published"]
@@ -103,10 +110,10 @@ def _tick(i: int, y: float, rate: float, error: float, can: bool) -> Iterator[tu
     stamps["published_ns"] = h["inclination_published"]
     yield _of("inclination", seq=i + 1, **stamps, angle_deg=y + error + 0.01, rate_deg_s=rate)
     yield _cycle(i, y, rate, error, (charge, exhaust, mode), h)
-    asked = dict(charge_current_ma=charge, exhaust_current_ma=exhaust, mode=mode, ready=1)
+    asked = {"charge_current_ma": charge, "exhaust_current_ma": exhaust, "mode": mode, "ready": 1}
     yield _of("command", seq=i + 1, stamp_ns=h["computed"], tick=i, **asked)
-    sent = dict(command_seq=i + 1, tick=i, command_received_ns=h["gate_received"], driver_stamp_ns=t)
-    currents = dict(charge_current_ma=charge, exhaust_current_ma=exhaust, charge_coil_ma=charge, exhaust_coil_ma=exhaust)
+    sent = {"command_seq": i + 1, "tick": i, "command_received_ns": h["gate_received"], "driver_stamp_ns": t}
+    currents = {"charge_current_ma": charge, "exhaust_current_ma": exhaust, "charge_coil_ma": charge, "exhaust_coil_ma": exhaust}
     yield _of("valves", seq=i + 1, stamp_ns=h["frame_sent"], **sent, **currents, gate=1, output=1)
     if can:
         frame = message("CanFrame").make(seq=i + 1, stamp_ns=h["frame_sent"], node=11, arbitration_id=0x80, dlc=8, data=(1,) * 8)
@@ -115,19 +122,36 @@ def _tick(i: int, y: float, rate: float, error: float, can: bool) -> Iterator[tu
 
 def _cycle(i: int, y: float, rate: float, error: float, drive: tuple[float, float, int], h: dict[str, int]) -> Any:
     t = _at(i)
-    cycle = dict(seq=i + 1, stamp_ns=t, tick=i, woken_ns=h["woken"], computed_ns=h["computed"], published_ns=h["published"])
-    cycle |= dict(pressure_seq=i + 1, pressure_stamp_ns=h["pressure_sampled"], pressure_age_ns=t - h["pressure_sampled"])
-    cycle |= dict(inclination_seq=i + 1, inclination_stamp_ns=h["inclination_sampled"], valve_seq=i)
-    cycle |= dict(inclination_age_ns=t - h["inclination_sampled"], trajectory_ns=i * PERIOD_NS)
-    measured = dict(supply_pressure_kpa=200.0, chamber_pressure_kpa=(y - 26.75) * 0.85, angle_deg=y + error + 0.01)
-    measured |= dict(reference_deg=y, reference_rate_deg_s=rate, angle_estimate_deg=y + error, error_deg=error, rate_deg_s=rate)
-    measured |= dict(desired_pressure_kpa=(y - 26.75) * 0.85 + 1.0, charge_current_ma=drive[0], exhaust_current_ma=drive[1])
-    return _of("cycle", **cycle, **measured, theta=tuple(float(k) for k in range(14)), phase=2, gate=1, mode=drive[2], inputs_valid=1)
+    cycle = {
+        "seq": i + 1,
+        "stamp_ns": t,
+        "tick": i,
+        "woken_ns": h["woken"],
+        "computed_ns": h["computed"],
+        "published_ns": h["published"],
+    }
+    cycle |= {"pressure_seq": i + 1, "pressure_stamp_ns": h["pressure_sampled"], "pressure_age_ns": t - h["pressure_sampled"]}
+    cycle |= {"inclination_seq": i + 1, "inclination_stamp_ns": h["inclination_sampled"], "valve_seq": i}
+    cycle |= {"inclination_age_ns": t - h["inclination_sampled"], "trajectory_ns": i * PERIOD_NS}
+    measured = {"supply_pressure_kpa": 200.0, "chamber_pressure_kpa": (y - 26.75) * 0.85, "angle_deg": y + error + 0.01}
+    measured |= {
+        "reference_deg": y,
+        "reference_rate_deg_s": rate,
+        "angle_estimate_deg": y + error,
+        "error_deg": error,
+        "rate_deg_s": rate,
+    }
+    measured |= {"desired_pressure_kpa": (y - 26.75) * 0.85 + 1.0, "charge_current_ma": drive[0], "exhaust_current_ma": drive[1]}
+    return _of("cycle", **cycle, **measured, theta=THETA, phase=2, gate=1, mode=drive[2], inputs_valid=1)
 
 
 def write_log(path: Path, made: list[tuple[str, str, Any]], *, finish: bool = True, chunk_bytes: int = 64 * 1024) -> Path:
     """Write messages as a log; `finish=False` leaves it as a killed recorder would, all chunks closed."""
-    attachments = {"bench.toml": BENCH_TOML, "versions.json": b'{"python": "3.11"}\n', "git.json": b'{"commit": "abc", "dirty": false}\n'}
+    attachments = {
+        "bench.toml": BENCH_TOML,
+        "versions.json": b'{"python": "3.11"}\n',
+        "git.json": b'{"commit": "abc", "dirty": false}\n',
+    }
     with path.open("wb") as file:
         writer = LogWriter(file, ORIGIN, attachments, chunk_bytes)
         for name, full_key, value in made:

@@ -1,0 +1,162 @@
+"""The command line. Everything heavy is imported inside the commands, so that `softloop --help` and each process start fast."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_OK, EXIT_USAGE, SoftloopError
+
+EXIT_CODES = """Exit codes: 0 all is well; 1 the command ran and its answer is no (a gate fault, a difference, a refused request);
+2 a bad argument or a bad file; 3 the machine (an address in use, a device or permission that is missing);
+4 a process or a wire was lost while running; 130 interrupted."""
+
+app = typer.Typer(
+    name="softloop",
+    help="Hardware-in-the-loop control of pneumatic soft bending actuators over Zenoh and CAN.",
+    epilog=EXIT_CODES,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 130},
+)
+
+BenchArgument = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="A bench file, or the name of a shipped one (sim).")]
+RunDir = Annotated[Path, typer.Option(metavar="DIR", help="The run's directory.")]
+
+
+@app.command(epilog=EXIT_CODES)
+def run(
+    bench: BenchArgument,
+    run_dir: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/<bench>-<UTC time>.")] = None,
+    duration: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="End after S seconds, armed.")] = None,
+    no_report: Annotated[bool, typer.Option("--no-report", help="Leave out the report at the end.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False,
+) -> int:
+    """Run a bench: start its processes, arm, watch, vent, stop, summary and report."""
+    from softloop.deploy.bench import find_bench
+    from softloop.deploy.launcher import Options, launch
+
+    options = Options(run_dir=run_dir, duration_s=duration, report=False if no_report else None, quiet=quiet)
+    return launch(find_bench(bench), options)
+
+
+@app.command()
+def node(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The process: the name of its table in the bench file.")],
+    bench: BenchArgument,
+    run_dir: RunDir,
+    lifeline_fd: Annotated[int | None, typer.Option(metavar="N", help="A pipe; when it ends, vent and exit.")] = None,
+) -> int:
+    """Be one process of a bench, in this terminal."""
+    from softloop.deploy.bench import find_bench
+    from softloop.deploy.node import run_node
+
+    return run_node(name, find_bench(bench), run_dir, lifeline_fd)
+
+
+@app.command()
+def check(bench: BenchArgument) -> int:
+    """Check a bench file, and that the actuator can follow its trajectory."""
+    from softloop.deploy.bench import find_bench, load_bench
+    from softloop.deploy.node import processes_of
+    from softloop.deploy.prepare import check_controller
+
+    loaded = load_bench(find_bench(bench))
+    trajectory_s = check_controller(loaded)
+    names = ", ".join(p.name for p in processes_of(loaded)) or "no process"
+    print(f"{bench}: good. Bench '{loaded.name}': {names}; trajectory {trajectory_s:.1f} s")
+    return EXIT_OK
+
+
+@app.command()
+def request(
+    bench: BenchArgument,
+    action: Annotated[Literal["arm", "disarm", "stop"], typer.Argument(help="stop: emergency stop, FAULT until armed again.")],
+    timeout: Annotated[float, typer.Option(metavar="S", min=0.1, help="How long to wait for the gate's answer.")] = 5.0,
+) -> int:
+    """Ask the gate of a running bench to arm, disarm or stop, and report its answer."""
+    from softloop.deploy.bench import find_bench, load_bench
+    from softloop.deploy.gate_requests import request_once
+
+    return request_once(load_bench(find_bench(bench)), action, timeout)
+
+
+@app.command()
+def report(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory, or a log in it.")],
+) -> int:
+    """Compute summary and report of a run again, from its log."""
+    from softloop.deploy.conclude import report_again
+
+    return report_again(run)
+
+
+@app.command()
+def warm(quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False) -> int:
+    """Compile every kernel once; later starts load them from the cache."""
+    from softloop.deploy.prepare import warm as warm_all
+    from softloop.deploy.progress import compile_progress
+
+    with compile_progress(quiet=quiet) as progress:
+        count = warm_all(progress)
+    if not quiet:
+        print(f"kernels of {count} modules are compiled")
+    return EXIT_OK
+
+
+@app.command()
+def router(bench: BenchArgument) -> int:
+    """Be the meeting point of a bench until Ctrl-C, for benches with `[run] shared_router = true`."""
+    from softloop.deploy.bench import find_bench, load_bench
+    from softloop.deploy.launcher import stop_on_signals
+    from softloop.deploy.router import run_router
+
+    with stop_on_signals() as stop:
+        run_router(load_bench(find_bench(bench)), stop)
+    return EXIT_OK
+
+
+@app.command(hidden=True)
+def prepare(bench: BenchArgument, run_dir: RunDir) -> int:
+    """The launcher's helper: compile, check, and put parameters into the run's directory; JSON lines on standard output."""
+    from softloop.deploy.bench import load_bench
+    from softloop.deploy.prepare import prepare_as_child
+
+    prepare_as_child(load_bench(bench, run_dir), run_dir)
+    return EXIT_OK
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The entry point: every error is one line on standard error, and a documented exit code."""
+    sys.exit(_run(arguments))
+
+
+def _run(arguments: list[str] | None) -> int:
+    try:
+        code = app(arguments, standalone_mode=False)
+    except SoftloopError as error:
+        return _complain(str(error), error.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        return _complain("interrupted", EXIT_INTERRUPTED)
+    except BrokenPipeError:
+        sys.stderr.close()  # whoever read our output is gone; nothing more can be said
+        return EXIT_LOST
+    except Exception as error:  # noqa: BLE001 - the last frame: a person gets one line
+        if hasattr(error, "format_message"):  # click's own: a wrong argument or option
+            return _complain(error.format_message(), EXIT_USAGE)
+        return _complain(f"stopped by a fault of its own: {error!r}", EXIT_LOST)
+    return code if isinstance(code, int) else EXIT_OK
+
+
+def _complain(text: str, code: int) -> int:
+    sys.stderr.write(f"softloop: {' '.join(text.split())}\n")
+    return code
+
+
+if __name__ == "__main__":
+    main()

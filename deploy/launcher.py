@@ -1,0 +1,232 @@
+"""`softloop run`: start the processes of a bench, arm, watch, vent, stop, and say how it went."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import FrameType
+
+from softloop.deploy.bench import Bench, read_source, validate
+from softloop.deploy.children import Child, Children
+from softloop.deploy.conclude import conclude
+from softloop.deploy.gate_requests import Requests, ask
+from softloop.deploy.live import View, make_view
+from softloop.deploy.node import STOP_ORDER, processes_of
+from softloop.deploy.prepare import Interrupted, prepare_in_child
+from softloop.deploy.progress import compile_progress
+from softloop.deploy.rig_state import GATE_FAULT, RigState
+from softloop.deploy.router import launcher_wire, remove_sockets
+from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench, make_run_dir
+from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, BadConfig, Unavailable
+from softloop.wire.session import Wire
+from softloop.wire.shell import Stop
+
+POLL_S = 0.1
+# The gate speaks 200 times a second; a second of silence, far above any pause of a healthy machine, is a hung process.
+GATE_SILENT_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended."""
+
+    code: int
+    text: str
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line may change for one run."""
+
+    run_dir: Path | None = None
+    duration_s: float | None = None
+    report: bool | None = None
+    quiet: bool = False
+
+
+def launch(bench_file: Path, options: Options) -> int:
+    """Run a bench from start to end; returns the exit code.
+
+    Raises:
+        BadFile, BadConfig: the bench file is wrong, or its trajectory not feasible.
+        Unavailable: the bench runs already, its address is in use, or the run directory cannot be made.
+    """
+    bench = _with_options(validate(read_source(bench_file)), options)
+    if not processes_of(bench):
+        raise BadConfig(f"{bench_file}: no process to run: it has none of the tables plant, valves, controller, ...")
+    with stop_on_signals() as stop, bench_lock(bench.name):
+        run_dir = make_run_dir(bench, options.run_dir)
+        source = read_source(bench_file, run_dir)
+        bench = _with_options(validate(source), options)
+        keep_bench(run_dir, source)
+        with compile_progress(quiet=options.quiet) as progress:
+            prepared = prepare_in_child(run_dir / BENCH_FILE, run_dir, stop, progress)
+        with launcher_wire(bench) as wire, closing(make_view(prepared.trajectory_s, quiet=options.quiet)) as view:
+            outcome = Launch(bench, run_dir, wire, view, stop, Children()).run()
+        return conclude(bench, run_dir, outcome.code, outcome.text, quiet=options.quiet)
+
+
+def _with_options(bench: Bench, options: Options) -> Bench:
+    """The bench with what the command line changes."""
+    changed: dict[str, float | bool] = {}
+    if options.duration_s is not None:
+        changed["duration_s"] = options.duration_s
+    if options.report is not None:
+        changed["report"] = options.report
+    return bench.model_copy(update={"run": bench.run.model_copy(update=changed)})
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[Stop]:
+    """A `Stop` that Ctrl-C, SIGTERM and a closed terminal set, instead of what they do otherwise."""
+    stop = Stop()
+
+    def on_signal(number: int, _frame: FrameType | None) -> None:
+        stop.set(signal.Signals(number).name)
+
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(number, on_signal) for number in numbers]
+    try:
+        yield stop
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+class Launch:
+    """One run of a bench, from the first process started to the last one gone."""
+
+    def __init__(self, bench: Bench, run_dir: Path, wire: Wire, view: View, stop: Stop, children: Children) -> None:
+        self.bench = bench
+        self.run_dir = run_dir
+        self.wire = wire
+        self.view = view
+        self.stop = stop
+        self.state = RigState(wire)
+        self.requests = Requests(wire)
+        self.children = children
+        self.words: dict[str, str] = {}
+        self.all_alive = False
+
+    def run(self) -> Outcome:
+        """Start, arm, watch; then vent and stop, whatever happened."""
+        try:
+            outcome = self._until_over()
+            self._show("stopping")
+            return self._vented(outcome)
+        finally:
+            self._stop_children()
+
+    def _until_over(self) -> Outcome:
+        self._start()
+        outcome = self._wait_alive()
+        if outcome is None and self.bench.run.arm and self.bench.valves is not None:
+            outcome = self._arm()
+        return outcome or self._watch()
+
+    def _start(self) -> None:
+        for process in processes_of(self.bench):
+            arguments = ["node", process.name, str(self.run_dir / BENCH_FILE), "--run-dir", str(self.run_dir)]
+            self.children.start(process.name, arguments, self.run_dir / f"{process.name}.log")
+            self.words[process.name] = "starting"
+
+    def _wait_alive(self) -> Outcome | None:
+        deadline = time.monotonic() + self.bench.run.ready_timeout_s
+        missing = set(self.words)
+        while missing and time.monotonic() < deadline:
+            alive = self.wire.processes_alive(timeout_s=POLL_S)
+            missing -= alive
+            self.words.update(dict.fromkeys(alive & set(self.words), "alive"))
+            self._refresh("starting")
+            trouble = self._trouble()
+            if trouble is not None:
+                return trouble
+            self.stop.wait(POLL_S)
+        if missing:
+            limit = self.bench.run.ready_timeout_s
+            return Outcome(EXIT_LOST, f"not alive after {limit:g} s: {self._last_words(missing)}; see the logs in {self.run_dir}")
+        self.all_alive = True
+        return None
+
+    def _last_words(self, names: set[str]) -> str:
+        said = {name: self.children.all[name].last_line() for name in sorted(names)}
+        return ", ".join(f"{name} ({line})" if line else name for name, line in said.items())
+
+    def _arm(self) -> Outcome | None:
+        limit = self.bench.run.arm_timeout_s
+        armed = ask(self.requests, self.state, "arm", limit, give_up=lambda: self._trouble() is not None, on_event=self.view.say)
+        if armed:
+            return None
+        refused = Outcome(EXIT_NEGATIVE, f"the gate was not armed within {limit:g} s: {self.state.reason}")
+        return self._trouble() or refused
+
+    def _watch(self) -> Outcome:
+        """Until the controller is done, the time is over, or something went wrong."""
+        began = time.monotonic()
+        duration_s = self.bench.run.duration_s
+        while True:
+            self._refresh("running")
+            trouble = self._trouble()
+            if trouble is not None:
+                return trouble
+            if self.state.done:
+                return Outcome(EXIT_OK, "the trajectory is done")
+            if duration_s and time.monotonic() - began >= duration_s:
+                return Outcome(EXIT_OK, f"ended after {duration_s:g} s as asked")
+            self.stop.wait(POLL_S)
+
+    def _trouble(self) -> Outcome | None:
+        """Why the run cannot go on, or None."""
+        if self.stop:
+            return Outcome(EXIT_INTERRUPTED, f"interrupted ({self.stop.reason})")
+        ended = self.children.ended()
+        if ended is not None:
+            return self._lost(ended)
+        if self.state.gate == GATE_FAULT:
+            return Outcome(EXIT_NEGATIVE, f"the gate went to FAULT: {self.state.reason}")
+        if self.state.valves is not None and time.monotonic_ns() - self.state.valves_heard_ns > GATE_SILENT_NS:
+            return Outcome(EXIT_LOST, "process 'valves' is silent: nothing heard from the gate for a second")
+        return None
+
+    def _lost(self, child: Child) -> Outcome:
+        self.words[child.name] = "ended"
+        return Outcome(EXIT_LOST if self.all_alive else child.exit_code_for_a_person(), child.epitaph())
+
+    def _vented(self, outcome: Outcome) -> Outcome:
+        """Disarm and wait until the chamber's pressure is gone, or not much longer."""
+        if self.bench.valves is None or self.state.valves is None:
+            return outcome
+        deadline = time.monotonic() + self.bench.run.vent_timeout_s
+        while time.monotonic() < deadline and not self._is_vented():
+            self.requests.send("disarm")
+            self._refresh("venting")
+            time.sleep(POLL_S)
+        if self._is_vented():
+            return outcome
+        pressure = self.state.pressure
+        left = "unknown" if pressure is None else f"{pressure.chamber_pressure_kpa:.1f} kPa"
+        return replace(outcome, text=f"{outcome.text}; the chamber was not vented in time, pressure {left}")
+
+    def _is_vented(self) -> bool:
+        return not self.state.armed and self.state.vented(self.bench.run.vented_kpa)
+
+    def _stop_children(self) -> None:
+        try:
+            for child in self.children.stop(STOP_ORDER, self.bench.run.stop_timeout_s):
+                self.view.say(f"process '{child.name}' did not end in {self.bench.run.stop_timeout_s:g} s and was killed")
+        finally:
+            self.children.close()
+            for child in self.children.all.values():
+                remove_sockets(self.bench, child.pid)
+
+    def _refresh(self, stage: str) -> None:
+        for line in self.state.refresh():
+            self.view.say(line)
+        self._show(stage)
+
+    def _show(self, stage: str) -> None:
+        self.view.show(stage, self.state, self.words)

@@ -1,0 +1,25 @@
+"""Progress of compiling kernels, on a terminal only, and only when there is something to wait for."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def compile_progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """A function `progress(module, done, total)` that shows how far compiling has come."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda module, done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("compiling kernels", total=None)
+
+        def show(module: str, done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total, description=f"compiling {module.removeprefix('softloop.')}")
+
+        yield show

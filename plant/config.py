@@ -1,0 +1,79 @@
+"""`[plant]` of the bench file: the simulated rig."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from softloop.wire.benchfile import Table
+
+
+class SensorConfig(Table):
+    """A pressure sensor as its data sheet has it; the rig layer adds this specimen's errors."""
+
+    zero_v: float = 0.0
+    full_v: float = 10.0
+    span_kpa: float = Field(250.0, gt=0, description="gauge pressure at full_v less that at zero_v")
+
+    @model_validator(mode="after")
+    def _usable(self) -> SensorConfig:
+        if not self.full_v > self.zero_v:
+            raise ValueError(f"full_v must be above zero_v, got {self.full_v} and {self.zero_v}")
+        return self
+
+
+class LoadConfig(Table):
+    """A payload or a contact that comes and goes. Times count from the plant's start, when its process enters its loop."""
+
+    kind: Literal["payload", "contact"]
+    on_s: float = Field(ge=0)
+    off_s: float = Field(1e9, gt=0, description="default: it stays")
+    size: float = Field(gt=0, description="payload: deg/s2 at 90 deg; contact: stiffness in deg/s2 per deg")
+    angle_deg: float = Field(90.0, description="contact: where the wall stands")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> LoadConfig:
+        if not self.on_s < self.off_s:
+            raise ValueError(f"on_s must be before off_s, got {self.on_s} and {self.off_s}")
+        return self
+
+
+class PlantConfig(Table):
+    """`[plant]`: which rig is simulated, and on which wires."""
+
+    layer: Literal["ideal", "rig"] = "rig"
+    seed: int = Field(1, ge=0, description="which specimen of a rig, and its noise")
+    parameters: str = Field("table1", description="parameter file about which the rig is drawn: a path, or a shipped name")
+    step_us: int = Field(500, ge=10, le=2000, description="longest integration step")
+
+    can_valves: str = "can0"
+    can_analog: str = "can0"
+    serial: str = Field("pty://{run_dir}/inclinometer", description="where the inclinometer's bytes go, a pyserial URL")
+    baud: int = Field(115_200, description="of the inclinometer as it leaves the shelf")
+    rate_hz: int = Field(200, description="of the inclinometer as it leaves the shelf")
+    bandwidth_hz: int = Field(256, description="of the inclinometer as it leaves the shelf")
+
+    supply_sensor: SensorConfig = SensorConfig()
+    chamber_sensor: SensorConfig = SensorConfig()
+    pressure_noise_kpa: float = Field(0.1, ge=0)
+    pressure_rise_ms: float = Field(3.0, ge=0, description="10 to 90 % of the sensors; none in the ideal layer")
+    angle_noise_deg: float = Field(0.05, ge=0)
+    rate_noise_deg_s: float = Field(0.1, ge=0)
+    coil_noise_ma: float = Field(0.05, ge=0)
+
+    vent_current_ma: float = Field(200.0, ge=0, description="exhaust current of the driver's own vent")
+    watchdog_ms: float = Field(20.0, gt=0)
+    command_delay_ms: float = Field(0.0, ge=0, le=1000, description="added to the wire to the driver, for latency studies")
+    measurement_delay_ms: float = Field(0.0, ge=0, le=1000, description="added to the wires from the sensors and the driver")
+
+    loads: tuple[LoadConfig, ...] = Field((), max_length=16)
+
+    @model_validator(mode="after")
+    def _known_device_settings(self) -> PlantConfig:
+        from softloop.devices.protocols.wt931 import BANDWIDTH_CODES, BAUD_CODES, RATE_CODES
+
+        for name, codes in (("baud", BAUD_CODES), ("rate_hz", RATE_CODES), ("bandwidth_hz", BANDWIDTH_CODES)):
+            if getattr(self, name) not in codes:
+                raise ValueError(f"{name} must be one of {', '.join(map(str, codes))}")
+        return self

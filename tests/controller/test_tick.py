@@ -1,0 +1,118 @@
+"""The tick as a whole: input health, phases, modes, saturation, and that it depends on nothing but its arguments."""
+
+import copy
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from softloop.controller import records as r
+from softloop.controller.config import ControllerConfig
+from softloop.controller.setup import PERIOD_NS, build
+
+MS = 1_000_000
+
+
+def fed(controller, tick, armed=True, angle=26.75, pressure=0.5, age_ns=3 * MS, status=0):
+    inputs = controller.inputs[0]
+    inputs.now_ns, inputs.tick, inputs.skipped = 10**9 + tick * PERIOD_NS, tick, 0
+    inputs.pressure.seq = inputs.inclination.seq = inputs.valves.seq = tick + 1
+    inputs.pressure.stamp_ns = inputs.inclination.stamp_ns = inputs.now_ns - age_ns
+    inputs.pressure.supply_pressure_kpa, inputs.pressure.chamber_pressure_kpa = 200.0, pressure
+    inputs.pressure.status = status
+    inputs.inclination.angle_deg, inputs.inclination.rate_deg_s = angle, 0.0
+    inputs.valves.gate = r.GATE_ARMED if armed else 0
+    return controller.tick()
+
+
+@pytest.fixture(params=["pid", "arc", "pressure"])
+def controller(request):
+    trajectory = "excitation_1hz" if request.param == "pressure" else "t1"
+    return build(ControllerConfig(law=request.param, trajectory=trajectory, approach_s=0.05))
+
+
+def test_it_waits_until_armed_with_valid_inputs_then_approaches_tracks_and_ends(controller):
+    controller.config.plan_ns = 20 * PERIOD_NS
+    assert fed(controller, 0, armed=False).phase == r.PHASE_WAIT
+    assert fed(controller, 1, status=1).phase == r.PHASE_WAIT
+    phases = [int(fed(controller, k).phase) for k in range(2, 50)]
+    assert phases == sorted(phases)
+    assert phases.count(r.PHASE_APPROACH) == 10
+    assert phases.count(r.PHASE_TRACK) == 20
+    assert phases[-1] == r.PHASE_DONE
+    last = controller.cycle[0]
+    assert last.charge_current_ma == last.exhaust_current_ma == 0.0
+
+
+def test_trajectory_time_counts_to_zero_through_the_approach(controller):
+    cycles = [int(fed(controller, k).trajectory_ns) for k in range(15)]
+    assert cycles == [-50 * MS + k * PERIOD_NS for k in range(15)]
+
+
+def test_a_gate_that_disarms_sends_it_back_to_wait_with_no_current(controller):
+    for k in range(5):
+        fed(controller, k)
+    cycle = fed(controller, 5, armed=False)
+    assert cycle.phase == r.PHASE_WAIT
+    assert cycle.charge_current_ma == cycle.exhaust_current_ma == 0.0
+
+
+@pytest.mark.parametrize("what", ["pressure", "inclination", "both"])
+def test_stale_inputs_are_said_and_stop_adaptation(controller, what):
+    for k in range(5):
+        assert fed(controller, k).inputs_valid
+    inputs = controller.inputs[0]
+    inputs.now_ns += 100 * MS
+    if what == "pressure":
+        inputs.inclination.stamp_ns += 100 * MS
+    if what == "inclination":
+        inputs.pressure.stamp_ns += 100 * MS
+    cycle = controller.tick()
+    assert not cycle.inputs_valid
+    assert not cycle.adapting
+
+
+def test_one_valve_works_at_a_time_and_currents_stay_in_range(controller):
+    rng = np.random.RandomState(2)
+    for k in range(400):
+        cycle = fed(controller, k, angle=rng.uniform(20, 150), pressure=rng.uniform(0, 150))
+        assert 0.0 <= cycle.charge_current_ma <= 220.0
+        assert 0.0 <= cycle.exhaust_current_ma <= 220.0
+        closed = {r.MODE_CHARGE: cycle.exhaust_current_ma, r.MODE_EXHAUST: cycle.charge_current_ma}.get(int(cycle.mode), 0.0)
+        assert closed < 80.0  # below any opening current
+    model = controller.model
+    assert np.all(cycle.theta >= model.theta_min)
+    assert np.all(cycle.theta <= model.theta_max)
+
+
+@given(st.lists(st.tuples(st.floats(20, 150), st.floats(0, 150), st.booleans()), min_size=1, max_size=30))
+def test_equal_inputs_give_equal_bytes(steps):
+    runs = []
+    for _ in range(2):
+        one = build_cached()
+        runs.append(b"".join(fed(one, k, armed, angle, p).tobytes() for k, (angle, p, armed) in enumerate(steps)))
+    assert runs[0] == runs[1]
+
+
+_FRESH = build(ControllerConfig(approach_s=0.05))
+
+
+def build_cached():
+    return copy.deepcopy(_FRESH)
+
+
+@given(*[st.floats(allow_nan=True, allow_infinity=True)] * 4)
+def test_no_number_on_the_inputs_makes_it_stop_or_ask_for_the_impossible(angle, rate, chamber, supply):
+    one = build_cached()
+    fed(one, 0)
+    inputs = one.inputs[0]
+    inputs.inclination.angle_deg, inputs.inclination.rate_deg_s = angle, rate
+    inputs.pressure.chamber_pressure_kpa, inputs.pressure.supply_pressure_kpa = chamber, supply
+    inputs.now_ns += PERIOD_NS
+    cycle = one.tick()
+    finite = all(np.isfinite(v) for v in (angle, rate, chamber, supply))
+    if not finite:
+        assert not cycle.inputs_valid
+    for current in (cycle.charge_current_ma, cycle.exhaust_current_ma):
+        assert np.isnan(current) or 0.0 <= current <= 220.0

@@ -1,0 +1,90 @@
+"""The process shell, in real processes: signals, the lifeline, faults, and a plain word on missing permissions."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.wire.rendezvous import short_folder
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from softloop.wire.config import HostConfig, ZenohConfig
+from softloop.wire.errors import BadConfig
+from softloop.wire.shell import run_process
+folder, body, lifeline = sys.argv[1], sys.argv[2], int(sys.argv[3])
+
+def loop(context):
+    context.enter_loop()
+    print("running", flush=True)
+    while not context.stop:
+        context.stop.wait(0.05)
+    print("stopped by", context.stop.reason, flush=True)
+
+def fault(context):
+    raise ZeroDivisionError("boom")
+
+def refused(context):
+    raise BadConfig("a wrong key")
+
+sys.exit(run_process("proc", {"loop": loop, "fault": fault, "refused": refused}[body], bench="t",
+    zenoh=ZenohConfig(endpoint=f"unixsock-stream/{folder}/m.sock"), host=HostConfig(), run_dir=Path(folder),
+    lifeline_fd=lifeline if lifeline >= 0 else None))
+"""
+
+
+def start(folder, body, lifeline=-1):
+    passed = (lifeline,) if lifeline >= 0 else ()
+    command = [sys.executable, "-c", SCRIPT, str(folder), body, str(lifeline)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, pass_fds=passed)
+
+
+def finish(process):
+    try:
+        return process.communicate(timeout=20)
+    finally:
+        if process.poll() is None:
+            process.kill()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_loop_cleanly(number):
+    with short_folder() as folder:
+        process = start(folder, "loop")
+        assert process.stdout.readline() == "running\n"
+        process.send_signal(number)
+        out, _ = finish(process)
+        assert out == f"stopped by {number.name}\n"
+        assert process.returncode == 0
+
+
+def test_a_closed_lifeline_ends_the_loop():
+    with short_folder() as folder:
+        read_end, write_end = os.pipe()
+        process = start(folder, "loop", read_end)
+        os.close(read_end)
+        assert process.stdout.readline() == "running\n"
+        time.sleep(0.2)
+        assert process.poll() is None
+        os.close(write_end)
+        out, _ = finish(process)
+        assert out == "stopped by lifeline closed\n"
+        assert process.returncode == 0
+
+
+def test_errors_are_one_line_with_their_exit_code_and_faults_keep_their_trace():
+    with short_folder() as folder:
+        process = start(folder, "refused")
+        _, err = finish(process)
+        assert err.splitlines()[-1] == "[proc] a wrong key"
+        assert process.returncode == 2
+        process = start(folder, "fault")
+        _, err = finish(process)
+        assert "Traceback" not in err
+        assert "ZeroDivisionError" in err.splitlines()[-1]
+        assert process.returncode == 4
+        assert "boom" in (folder / "proc.trace.txt").read_text()
