@@ -14,10 +14,10 @@ class ActuationConfig(Table):
 
     modes: Literal["table2", "flow"] = Field("flow", description="the paper's Table 2, or the sign of the demanded flow")
     flow_hold_kpa_s: float = Field(4.0, ge=0, description="a smaller demand opens no valve")
-    error_hold_deg: float = Field(0.3, ge=0, description="epsilon_0: on a dwell, hold below this error")
-    error_release_deg: float = Field(0.5, ge=0, description="and leave hold above this one")
+    error_hold_deg: float = Field(0.1, ge=0, description="epsilon_0: on a dwell, hold below this error")
+    error_release_deg: float = Field(0.2, ge=0, description="and leave hold above this one")
     rate_still_deg_s: float = Field(0.5, ge=0, description="a slower reference counts as a dwell")
-    switch_ticks: int = Field(2, ge=1, le=200, description="a mode stays at least this many ticks")
+    switch_ticks: int = Field(3, ge=1, le=200, description="a mode stays at least this many ticks")
     bias_fraction: float = Field(0.8, ge=0, le=0.95, description="the closed valve waits at this part of its opening current")
 
 
@@ -37,16 +37,16 @@ class PidConfig(Table):
 class ArcConfig(Table):
     """`[controller.arc]`: C3, Eqs. 33 to 48."""
 
-    k_s: float = Field(6.0, gt=0, description="K_S1, 1/s")
-    k1: float = Field(8.0, gt=0, description="K_1, 1/s")
-    k2: float = Field(25.0, gt=0, description="K_2, 1/s")
+    k_s: float = Field(15.0, gt=0, description="K_S1, 1/s")
+    k1: float = Field(30.0, gt=0, description="K_1, 1/s")
+    k2: float = Field(50.0, gt=0, description="K_2, 1/s")
     rho: float = Field(10.0, gt=0, description="weight of S2 in V2; 1 is the paper's text")
-    epsilon1: float = Field(1.0e5, gt=0, description="(deg/s)^2/s, Eq. 38")
-    epsilon2: float = Field(1.0e4, gt=0, description="kPa^2/s, Eq. 47")
+    epsilon1: float = Field(5.0e4, gt=0, description="(deg/s)^2/s, Eq. 38")
+    epsilon2: float = Field(1.0e5, gt=0, description="kPa^2/s, Eq. 47")
     delta1: float = Field(100.0, ge=0, description="bound of Delta_1, deg/s2")
     delta2: float = Field(60.0, ge=0, description="bound of Delta_2, kPa/s")
-    gamma: float = Field(1.0e-5, ge=0, description="adaptation gain of the mechanics, times theta_M^2")
-    gamma_valve: float = Field(1.0e-5, ge=0, description="adaptation gain of valves and leak, times theta_M^2")
+    gamma: float = Field(5.0e-5, ge=0, description="adaptation gain of the mechanics, times theta_M^2")
+    gamma_valve: float = Field(3.0e-6, ge=0, description="adaptation gain of valves and leak, times theta_M^2")
     rate_limit: float = Field(0.5, gt=0, description="an estimate moves at most this part of its range in 1 s")
     desired_max_kpa: float = Field(150.0, gt=0)
 

@@ -7,11 +7,11 @@ from typing import Any
 from softloop.controller.config import ControllerConfig
 from softloop.controller.records import INPUTS, PHASE_WAIT
 from softloop.controller.setup import PERIOD_NS, Controller, build
-from softloop.wire.channels import COMMAND, CYCLE, EVENT, INCLINATION, PRESSURE, VALVES
+from softloop.wire.channels import COMMAND, CYCLE, INCLINATION, PRESSURE, VALVES
 from softloop.wire.clock import Deadlines
 from softloop.wire.messages import BadPayload, constant, message
 from softloop.wire.shell import Context
-from softloop.wire.status import StatusReporter
+from softloop.wire.status import EventReporter, StatusReporter
 
 _SOURCE = constant("Event", "SOURCE_CONTROLLER")
 _KIND_PHASE = constant("Event", "KIND_PHASE")
@@ -30,6 +30,7 @@ def run(config: ControllerConfig, context: Context) -> None:
         loop.controller.tick()
         loop.write()
         deadlines.advance(context.clock.now_ns())
+    loop.close()
 
 
 class ControllerLoop:
@@ -40,12 +41,11 @@ class ControllerLoop:
         self.controller = controller
         self.clock = context.clock
         self.inputs = [self._input(wire.latest(c), name) for c, name in _INPUTS]
-        self.put_command, self.put_cycle, self.put_event = (wire.publisher(c) for c in (COMMAND, CYCLE, EVENT))
+        self.put_command, self.put_cycle = wire.publisher(COMMAND), wire.publisher(CYCLE)
         self.status = StatusReporter(context, _SOURCE)
-        self.command, self.event = message("ValveCommand"), message("Event")
-        self.record = message("CycleRecord")
+        self.events = EventReporter(context, _SOURCE)
+        self.command, self.record = message("ValveCommand"), message("CycleRecord")
         self.phase = PHASE_WAIT
-        self.events = 0
         self.woken_ns = 0
 
     def _input(self, latest: Any, field: str) -> tuple[Any, Any, Any]:
@@ -83,10 +83,10 @@ class ControllerLoop:
         cycle.published_ns = self.clock.now_ns()
         self.put_cycle(self.record.pack_record(cycle))
         if cycle.phase != self.phase:
-            self._say(_KIND_PHASE, code=int(cycle.phase))
+            self.events.say(_KIND_PHASE, int(cycle.stamp_ns), code=int(cycle.phase), tick=int(cycle.tick))
             self.phase = int(cycle.phase)
         if cycle.skipped:
-            self._say(_KIND_OVERRUN, value=float(cycle.skipped))
+            self.events.say(_KIND_OVERRUN, int(cycle.stamp_ns), value=float(cycle.skipped), tick=int(cycle.tick))
         self.status.cycle(late_ns=self.woken_ns - int(cycle.stamp_ns), skipped=int(cycle.skipped))
 
     def _command(self, cycle: Any) -> bytes:
@@ -106,11 +106,9 @@ class ControllerLoop:
             )
         )
 
-    def _say(self, kind: int, code: int = 0, value: float = 0.0) -> None:
-        self.events += 1
-        cycle = self.controller.cycle[0]
-        fields = {"seq": self.events, "stamp_ns": int(cycle.stamp_ns), "tick": int(cycle.tick)}
-        self.put_event(self.event.pack(self.event.make(**fields, value=value, source=_SOURCE, kind=kind, code=code)))
+    def close(self) -> None:
+        """Say that this process ends."""
+        self.status.close()
 
 
 _INPUTS = ((PRESSURE, "pressure"), (INCLINATION, "inclination"), (VALVES, "valves"))

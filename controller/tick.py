@@ -221,4 +221,5 @@ def controller_tick(
     state.seq += 1
     state.skipped_total += inputs.skipped
     record_inputs(inputs, state, cycle)
-    record_thoughts(config, measurement, reference, demand, state, valid, cycle)
+    reference_now(config, knots, table, state, inputs.now_ns, scratch.end)  # what is logged stands at the tick, not ahead of it
+    record_thoughts(config, measurement, scratch.end, demand, state, valid, cycle)

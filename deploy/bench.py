@@ -55,6 +55,7 @@ class Source:
     file: Path
     content: dict[str, Any]
     origins: dict[Key, Path] = field(default_factory=dict)
+    run_dir: Path | None = None
 
     def origin(self, where: Key) -> Path:
         """The file in which a key, or the nearest table around it, stands."""
@@ -89,7 +90,7 @@ def read_source(path: Path, run_dir: Path | None = None) -> Source:
             _remove(content, origins, name, file)
         own.pop("base", None)
         _merge(content, origins, _substituted(own, file, run_dir), file, ())
-    return Source(path, content, origins)
+    return Source(path, content, origins, run_dir)
 
 
 def load_bench(path: Path, run_dir: Path | None = None) -> Bench:
@@ -113,7 +114,10 @@ def validate(source: Source) -> Bench:
         where = tuple(str(part) for part in error.errors()[0]["loc"])
         return load_model(Bench, source.content, source.origin(where))  # says it in one line
     _check_can_names(bench, source)
-    return bench
+    if source.run_dir is None:
+        return bench
+    # Default values may name the run directory too.
+    return Bench.model_validate(_substituted(bench.model_dump(), source.file, source.run_dir))
 
 
 def _check_can_names(bench: Bench, source: Source) -> None:
@@ -185,7 +189,7 @@ def _merge(content: dict[str, Any], origins: dict[Key, Path], own: dict[str, Any
 def _substituted(value: Any, file: Path, run_dir: Path | None) -> Any:
     if isinstance(value, dict):
         return {key: _substituted(inner, file, run_dir) for key, inner in value.items()}
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return [_substituted(inner, file, run_dir) for inner in value]
     if not isinstance(value, str):
         return value

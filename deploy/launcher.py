@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 
-from softloop.deploy.bench import Bench, read_source, validate
+from softloop.deploy.bench import Bench, load_bench
 from softloop.deploy.children import Child, Children
 from softloop.deploy.conclude import conclude
 from softloop.deploy.gate_requests import Requests, ask
@@ -55,14 +55,13 @@ def launch(bench_file: Path, options: Options) -> int:
         BadFile, BadConfig: the bench file is wrong, or its trajectory not feasible.
         Unavailable: the bench runs already, its address is in use, or the run directory cannot be made.
     """
-    bench = _with_options(validate(read_source(bench_file)), options)
+    bench = _with_options(load_bench(bench_file), options)
     if not processes_of(bench):
         raise BadConfig(f"{bench_file}: no process to run: it has none of the tables plant, valves, controller, ...")
     with stop_on_signals() as stop, bench_lock(bench.name):
         run_dir = make_run_dir(bench, options.run_dir)
-        source = read_source(bench_file, run_dir)
-        bench = _with_options(validate(source), options)
-        keep_bench(run_dir, source)
+        bench = _with_options(load_bench(bench_file, run_dir), options)
+        keep_bench(run_dir, bench)
         with compile_progress(quiet=options.quiet) as progress:
             prepared = prepare_in_child(run_dir / BENCH_FILE, run_dir, stop, progress)
         with launcher_wire(bench) as wire, closing(make_view(prepared.trajectory_s, quiet=options.quiet)) as view:

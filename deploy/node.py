@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from softloop.deploy.bench import Bench, load_bench
+from softloop.plant.config import plant_process
 from softloop.wire.errors import BadConfig
 from softloop.wire.shell import Context, run_process
 
@@ -35,7 +36,7 @@ class Process:
 # In the order in which they are started; any order works.
 PROCESSES = (
     Process("recorder", "softloop.watch.recorder", False, "SOURCE_RECORDER", lambda bench: bench.recorder),
-    Process("plant", "softloop.plant.process", True, "SOURCE_PLANT", lambda bench: bench.plant),
+    Process("plant", "softloop.plant.process", True, "SOURCE_PLANT", lambda bench: plant_process(bench.plant, bench.can)),
     Process("valves", "softloop.devices.valves", True, "SOURCE_GATE", lambda bench: bench.valves),
     Process("pressures", "softloop.devices.pressures", True, "SOURCE_PRESSURES", lambda bench: bench.pressures),
     Process("inclinometer", "softloop.devices.inclinometer", True, "SOURCE_INCLINOMETER", lambda bench: bench.inclinometer),

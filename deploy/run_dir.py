@@ -11,7 +11,7 @@ from time import gmtime, strftime
 
 import tomlkit
 
-from softloop.deploy.bench import Bench, Source
+from softloop.deploy.bench import Bench
 from softloop.wire.config import runtime_dir
 from softloop.wire.errors import Unavailable
 
@@ -34,10 +34,11 @@ def make_run_dir(bench: Bench, asked: Path | None) -> Path:
     return path.resolve()
 
 
-def keep_bench(run_dir: Path, source: Source) -> Path:
-    """Write the bench, merged and with its texts substituted, into the run's directory; returns the file."""
+def keep_bench(run_dir: Path, bench: Bench) -> Path:
+    """Write the whole bench into the run's directory, every default included; returns the file."""
     file = run_dir / BENCH_FILE
-    file.write_text(tomlkit.dumps(source.content), encoding="utf-8")
+    text = tomlkit.dumps(bench.model_dump(mode="json", exclude_none=True))
+    file.write_text(f"# The bench of this run: bases merged, defaults written out, addresses filled in.\n{text}", encoding="utf-8")
     return file
 
 

@@ -141,6 +141,18 @@ def open_log(path: Path | str) -> Log:
         raise BadFile(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
+def find_log(run: Path | str) -> Path:
+    """The log of a run: the file itself, or the one `.mcap` in its directory. Raises BadFile when there is none or several."""
+    path = Path(run)
+    if not path.is_dir():
+        return path
+    found = sorted(path.glob("*.mcap"))
+    if len(found) != 1:
+        names = ", ".join(f.name for f in found) or "none"
+        raise BadFile(f"{path}: a run's directory holds one .mcap log; here: {names}")
+    return found[0]
+
+
 class _Reader:
     """The state of one reading."""
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Literal
 
 from pydantic import Field, model_validator
 
+from softloop.devices.protocols.wt931 import BANDWIDTH_CODES, BAUD_CODES, RATE_CODES
 from softloop.wire.benchfile import Table
+from softloop.wire.can_config import CanConfig
+from softloop.wire.errors import BadConfig
 
 
 class SensorConfig(Table):
@@ -71,9 +76,25 @@ class PlantConfig(Table):
 
     @model_validator(mode="after")
     def _known_device_settings(self) -> PlantConfig:
-        from softloop.devices.protocols.wt931 import BANDWIDTH_CODES, BAUD_CODES, RATE_CODES
-
         for name, codes in (("baud", BAUD_CODES), ("rate_hz", RATE_CODES), ("bandwidth_hz", BANDWIDTH_CODES)):
             if getattr(self, name) not in codes:
                 raise ValueError(f"{name} must be one of {', '.join(map(str, codes))}")
         return self
+
+
+@dataclass(frozen=True)
+class PlantProcess:
+    """What the process `plant` is given."""
+
+    plant: PlantConfig
+    valves_bus: CanConfig
+    analog_bus: CanConfig
+
+
+def plant_process(plant: PlantConfig, buses: Mapping[str, CanConfig]) -> PlantProcess:
+    """The config of `plant` with its buses. Raises BadConfig on an unknown bus."""
+    for key in ("can_valves", "can_analog"):
+        name = getattr(plant, key)
+        if name not in buses:
+            raise BadConfig(f"key 'plant.{key}': there is no [can.{name}]; there are: {', '.join(sorted(buses)) or '(none)'}")
+    return PlantProcess(plant, buses[plant.can_valves], buses[plant.can_analog])

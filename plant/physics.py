@@ -30,6 +30,7 @@ from softloop.wire.kernel import kernel
 _F8 = types.f8
 _I8 = types.i8
 _NS = 1e-9
+_SETTLED_MA = 1e-9  # a coil's transient ends here, before it becomes a denormal number, which is slow
 
 
 @kernel(_F8(_F8, _F8, _F8))
@@ -63,12 +64,17 @@ def _next_stage(params: Any, state: Any, weight: float, step_s: float) -> None:
         state.stage[i] = state.x[i] + step_s * state.slope[i]
 
 
+@kernel(_F8(_F8))
+def _left(transient_ma: float) -> float:
+    return transient_ma if abs(transient_ma) > _SETTLED_MA else 0.0
+
+
 @kernel(types.void(PLANT_TYPE, STATE_TYPE, _F8, _F8))
 def step(params: Any, state: Any, step_s: float, half_decay: float) -> None:
     """One RK4 step. `half_decay` is what is left of a coil's transient after half of it."""
     air = params.air
     charge, exhaust = state.command_charge_ma, state.command_exhaust_ma
-    charge_off, exhaust_off = state.coil_charge_ma - charge, state.coil_exhaust_ma - exhaust
+    charge_off, exhaust_off = _left(state.coil_charge_ma - charge), _left(state.coil_exhaust_ma - exhaust)
     middle_in = play(charge + charge_off * half_decay, state.play_charge_ma, air.play_charge_ma)
     middle_out = play(exhaust + exhaust_off * half_decay, state.play_exhaust_ma, air.play_exhaust_ma)
     end_in = play(charge + charge_off * half_decay * half_decay, state.play_charge_ma, air.play_charge_ma)

@@ -48,7 +48,7 @@ _MAX_PUBLISHERS = 2048  # all standard ids; whoever sends more extended ids than
 _MAX_SENDERS = 1024
 _SETTLE_S = 0.02  # measured: links to all others stand 1 to 3 ms after the meeting point answered
 _SETTLE_AT_MOST_S = 0.5
-_KNOWN_AT_MOST_S = 0.5
+_ANSWER_AT_MOST_S = 0.5
 
 
 class FramePublisher:
@@ -153,12 +153,13 @@ class ZenohBus(can.BusABC):
         head = f"{ROOT}/{self._bench}/{CAN.name}/{self._channel}/"
         self._key_head = head
         self._publisher = FramePublisher(session, self._bench, self._channel)
+        self._name_key = f"{ROOT}/{self._bench}/buses/{self._channel}/{self._node:x}"
         try:
-            self._token = session.liveliness().declare_token(_token_key(self._bench, self._channel, self._node))
             handler = zenoh.handlers.Callback(self._receive, indirect=False)
             self._subscriber = session.declare_subscriber(head + "*", handler)
-            # The answers come after all neighbours know of this subscription: from now on nothing passes it by.
-            list(session.liveliness().get(_token_key(self._bench, self._channel, self._node), timeout=_KNOWN_AT_MOST_S))
+            self._answers = session.declare_queryable(self._name_key, zenoh.handlers.Callback(self._answer, indirect=False))
+            # An answer comes after its sender knows of this subscription: from now on no frame passes it by.
+            _buses_there(session, self._bench, self._channel)
         except zenoh.ZError as error:
             self._close_own_session()
             raise can.CanInitializationError(f"the Zenoh session cannot be used: {_first_line(error)}") from None
@@ -179,6 +180,10 @@ class ZenohBus(can.BusABC):
             return
         if self._wanted(frame):
             self._queue.put(frame)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with query, contextlib.suppress(zenoh.ZError):
+            query.reply(self._name_key, b"")
 
     def _count_lost(self, frame: CanFrame) -> None:
         with self._counting:
@@ -249,7 +254,7 @@ class ZenohBus(can.BusABC):
         super().shutdown()
         self._queue.close()
         self._publisher.close()
-        for declared in (self._subscriber, self._token):
+        for declared in (self._subscriber, self._answers):
             with contextlib.suppress(zenoh.ZError):
                 declared.undeclare()
         self._close_own_session()
@@ -318,8 +323,15 @@ def _neighbours(session: zenoh.Session) -> set[str]:
     return {str(zid) for zid in (*session.info.peers_zid(), *session.info.routers_zid())}
 
 
-def _token_key(bench: str, channel: str, node: int) -> str:
-    return f"{ROOT}/{bench}/buses/{channel}/{node:x}"
+def _buses_there(session: zenoh.Session, bench: str, channel: str = "*") -> set[str]:
+    """The channels of a bench on which there are buses now; waits until all have answered, or half a second."""
+    replies = session.get(
+        f"{ROOT}/{bench}/buses/{channel}/*",
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        timeout=_ANSWER_AT_MOST_S,
+    )
+    return {str(reply.ok.key_expr).split("/")[3] for reply in replies if reply.ok}
 
 
 def _channels_in_use(bench: str, endpoint: str) -> set[str]:
@@ -327,8 +339,7 @@ def _channels_in_use(bench: str, endpoint: str) -> set[str]:
         return set()
     session = _join(bench, endpoint)
     try:
-        replies = session.liveliness().get(f"{ROOT}/{bench}/buses/*/*", timeout=1.0)
-        return {str(reply.ok.key_expr).split("/")[3] for reply in replies if reply.ok}
+        return _buses_there(session, bench)
     finally:
         session.close()
 

@@ -40,6 +40,9 @@ def make_config(
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
         "open/return_conditions/connect_scouted": False,
         "transport/link/tx/lease": lease_ms,
+        # A frozen process still has its socket: without these, who meets it waits 10 s, also in closing its own session.
+        "transport/unicast/open_timeout": 1000,
+        "transport/unicast/accept_timeout": 1000,
         # A stalled reader must cost the 5 ms path nothing: what cannot be sent now is dropped.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
         "transport/shared_memory/enabled": False,

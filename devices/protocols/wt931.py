@@ -55,11 +55,6 @@ class Parser:
         self._rest = b""
         self.taken = self.accepted = self.skipped = self.bad_sum = self.unknown_type = 0
 
-    @property
-    def wanted(self) -> int:
-        """How many more bytes the next packet needs at least: what a reader should ask its port for."""
-        return PACKET_BYTES - len(self._rest)
-
     def feed(self, data: bytes) -> list[Packet]:
         """The packets that are complete with `data`."""
         self.taken += len(data)
@@ -76,6 +71,11 @@ class Parser:
             at += self._look(buffer, at, packets)
         self._rest = buffer[at:]
         return packets
+
+    def forget(self) -> None:
+        """Begin anew with the next byte: the stream was interrupted."""
+        self.skipped += len(self._rest)
+        self._rest = b""
 
     def _look(self, buffer: bytes, at: int, packets: list[Packet]) -> int:
         """Judge the eleven bytes at `at`; how far to go on."""
@@ -133,18 +133,12 @@ class CommandParser:
         return found
 
 
-def settings(rate_hz: int, baud: int, bandwidth_hz: int) -> list[tuple[int, int]]:
-    """(register, value) of gyro and angle packets at this rate, six axes: no magnetometer beside solenoids.
+def settings(rate_hz: int, bandwidth_hz: int) -> dict[int, int]:
+    """Register -> value for gyro and angle packets at this rate, six axes: no magnetometer beside solenoids.
 
-    Raises KeyError on a rate, baud or bandwidth that the device does not have.
+    Raises KeyError on a rate or bandwidth that the device does not have.
     """
-    return [
-        (RSW, RSW_GYRO_ANGLE),
-        (RRATE, RATE_CODES[rate_hz]),
-        (BANDWIDTH, BANDWIDTH_CODES[bandwidth_hz]),
-        (AXIS6, 1),
-        (BAUD, BAUD_CODES[baud]),
-    ]
+    return {RSW: RSW_GYRO_ANGLE, RRATE: RATE_CODES[rate_hz], BANDWIDTH: BANDWIDTH_CODES[bandwidth_hz], AXIS6: 1}
 
 
 # --- from packets to samples ----------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from softloop.deploy.bench import read_source, validate
+from softloop.deploy.bench import load_bench
 from softloop.deploy.children import Children
 from softloop.deploy.launcher import Launch
 from softloop.deploy.live import PlainView
@@ -55,9 +55,8 @@ def launch(run_dir, wrong, stop=None, **changes):
     limits = LIMITS | changes
     file.write_text(BENCH + "[run]\n" + "".join(f"{key} = {value}\n" for key, value in limits.items()))
     (run_dir / "toy.json").write_text(json.dumps(wrong))
-    source = read_source(file, run_dir)
-    bench = validate(source)
-    keep_bench(run_dir, source)
+    bench = load_bench(file, run_dir)
+    keep_bench(run_dir, bench)
     view, children = Said(), Children(TOY)
     with launcher_wire(bench) as wire:
         outcome = Launch(bench, run_dir, wire, view, stop or Stop(), children).run()

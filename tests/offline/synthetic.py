@@ -23,6 +23,7 @@ BENCH_TOML = b'name = "synthetic"\n\n[controller]\nlaw = "arc"\n'
 GIT = b'{"commit": "abc", "dirty": false}\n'
 BY_NAME = {c.name: c for c in CHANNELS}
 
+APPROACH_TICKS = 20
 THETA = tuple(float(k) for k in range(14))
 
 # The hops of every sample and command, in ns after the tick they belong to (negative: before it).
@@ -64,7 +65,7 @@ def reference_deg(seconds: float, moving: bool) -> np.ndarray[Any, Any]:
     return steps[low] + (steps[low + 1] - steps[low]) * (u**3 * (10 - 15 * u + 6 * u * u))
 
 
-def messages(seconds: float = 4.0, *, moving: bool = False, seed: int = 1, can: bool = True) -> Iterator[tuple[str, str, Any]]:
+def messages(seconds: float = 4.0, *, moving: bool = False, seed: int = 1, jitter_ns: int = 0) -> Iterator[tuple[str, str, Any]]:
     """(channel name, key, named tuple) of a run, in the order in which a recorder would get them."""
     noise = np.random.RandomState(seed)
     y = reference_deg(seconds, moving)
@@ -73,7 +74,8 @@ def messages(seconds: float = 4.0, *, moving: bool = False, seed: int = 1, can: 
     n = len(y)
     error = 1.5 * np.exp(-np.arange(n) * 0.005 / 0.8) + 0.02 * rate + noise.normal(0, 0.05, n)
     for i in range(n):
-        yield from _tick(i, y[i], rate[i], error[i], can)
+        late_ns = int(noise.exponential(jitter_ns)) if jitter_ns else 0
+        yield from _tick(i, y[i], rate[i], error[i], late_ns)
         if i % 200 == 0:
             yield _of("status", seq=i // 200 + 1, stamp_ns=_at(i), pid=7, cycles=i, process=1, state=1)
     yield _of("request", seq=1, stamp_ns=_at(0), origin=9, action=1)
@@ -90,8 +92,8 @@ def _of(name: str, **values: Any) -> tuple[str, str, Any]:
     return name, key(BENCH, channel), message(channel.message).make(**values)
 
 
-def _tick(i: int, y: float, rate: float, error: float, can: bool) -> Iterator[tuple[str, str, Any]]:
-    t, h = _at(i), {k: _at(i) + v for k, v in HOPS_NS.items()}
+def _tick(i: int, y: float, rate: float, error: float, late_ns: int) -> Iterator[tuple[str, str, Any]]:
+    t, h = _at(i), {k: _at(i) + v + (late_ns if v > 0 else 0) for k, v in HOPS_NS.items()}
     charge, exhaust = (90.0 + rate, 0.0) if rate > 0 else (0.0, 90.0 - rate) if rate < 0 else (0.0, 0.0)
     mode = 1 if rate > 0 else 2 if rate < 0 else 3
     pressure = (y - 26.75) * 0.85
@@ -115,9 +117,8 @@ def _tick(i: int, y: float, rate: float, error: float, can: bool) -> Iterator[tu
     sent = {"command_seq": i + 1, "tick": i, "command_received_ns": h["gate_received"], "driver_stamp_ns": t}
     currents = {"charge_current_ma": charge, "exhaust_current_ma": exhaust, "charge_coil_ma": charge, "exhaust_coil_ma": exhaust}
     yield _of("valves", seq=i + 1, stamp_ns=h["frame_sent"], **sent, **currents, gate=1, output=1)
-    if can:
-        frame = message("CanFrame").make(seq=i + 1, stamp_ns=h["frame_sent"], node=11, arbitration_id=0x80, dlc=8, data=(1,) * 8)
-        yield "can", can_key(BENCH, "can0", 0x80), frame
+    frame = message("CanFrame").make(seq=i + 1, stamp_ns=h["frame_sent"], node=11, arbitration_id=0x80, dlc=8, data=(1,) * 8)
+    yield "can", can_key(BENCH, "can0", 0x80), frame
 
 
 def _cycle(i: int, y: float, rate: float, error: float, drive: tuple[float, float, int], h: dict[str, int]) -> Any:
@@ -132,7 +133,7 @@ def _cycle(i: int, y: float, rate: float, error: float, drive: tuple[float, floa
     }
     cycle |= {"pressure_seq": i + 1, "pressure_stamp_ns": h["pressure_sampled"], "pressure_age_ns": t - h["pressure_sampled"]}
     cycle |= {"inclination_seq": i + 1, "inclination_stamp_ns": h["inclination_sampled"], "valve_seq": i}
-    cycle |= {"inclination_age_ns": t - h["inclination_sampled"], "trajectory_ns": i * PERIOD_NS}
+    cycle |= {"inclination_age_ns": t - h["inclination_sampled"], "trajectory_ns": (i - APPROACH_TICKS) * PERIOD_NS}
     measured = {"supply_pressure_kpa": 200.0, "chamber_pressure_kpa": (y - 26.75) * 0.85, "angle_deg": y + error + 0.01}
     measured |= {
         "reference_deg": y,
@@ -142,7 +143,9 @@ def _cycle(i: int, y: float, rate: float, error: float, drive: tuple[float, floa
         "rate_deg_s": rate,
     }
     measured |= {"desired_pressure_kpa": (y - 26.75) * 0.85 + 1.0, "charge_current_ma": drive[0], "exhaust_current_ma": drive[1]}
-    return _of("cycle", **cycle, **measured, theta=THETA, phase=2, gate=1, mode=drive[2], inputs_valid=1)
+    return _of(
+        "cycle", **cycle, **measured, theta=THETA, phase=1 if i < APPROACH_TICKS else 2, gate=1, mode=drive[2], inputs_valid=1
+    )
 
 
 def write_log(path: Path, made: list[tuple[str, str, Any]], *, finish: bool = True, chunk_bytes: int = 64 * 1024) -> Path:

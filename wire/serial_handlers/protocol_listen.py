@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 import serial
 
 _STALE_AT_MOST = 65536  # bytes of a client that left, kept while the next one is let in
+_SEND_BUFFER = 16384  # as a pseudo-terminal has; TCP's own grows to megabytes, minutes of old bytes for a reader that comes back
 _GONE = select.EPOLLRDHUP | select.EPOLLHUP | select.EPOLLERR
 
 
@@ -162,6 +163,7 @@ class Serial(serial.SerialBase):  # type: ignore[misc]  # pyserial has no types
             return
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         assert self._events is not None
         self._events.register(client, select.EPOLLIN | select.EPOLLRDHUP)
         self._client = client

@@ -1,0 +1,242 @@
+"""The process `valves`: the safety gate between the controller and the valve driver on CAN.
+
+It wakes on each command, or, when none comes, a little after it was due; each time it runs `gate_step` once and sends one
+valve frame. What happens without it: the driver's watchdog vents.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from softloop.devices import gate as g
+from softloop.devices.config import PERIOD_NS, ValvesProcess
+from softloop.devices.protocols import can_frames
+from softloop.devices.protocols.quantise import counts_to_current
+from softloop.wire.can_config import open_port
+from softloop.wire.can_port import CanPort
+from softloop.wire.channels import COMMAND, REQUEST, VALVES
+from softloop.wire.errors import Lost
+from softloop.wire.kernel import new_record
+from softloop.wire.messages import BadPayload, constant, message, names_of
+from softloop.wire.shell import Context, say
+from softloop.wire.status import EventReporter, StatusReporter
+
+_COMMAND, _REQUEST, _STATUS = message("ValveCommand"), message("GateRequest"), message("ValveStatus")
+_STOP, _DISARM, _ARM = (constant("GateRequest", f"ACTION_{a}") for a in ("STOP", "DISARM", "ARM"))
+_SOURCE = constant("Event", "SOURCE_GATE")
+_KIND_GATE, _KIND_DRIVER, _KIND_BUS = (constant("Event", f"KIND_{k}") for k in ("GATE", "DRIVER", "BUS"))
+_GATES, _REASONS = names_of("ValveStatus", "GATE_"), names_of("ValveStatus", "REASON_")
+_INT63 = 2**63 - 1  # what of a requester's number the gate compares
+_FRAMES_AT_ONCE = 64  # a babbling bus must not keep the gate from its own frame
+_SHUTDOWN_FRAMES = 5
+_PATIENCE_NS = 1_000_000_000  # for the driver's first word
+
+
+def run(config: ValvesProcess, context: Context) -> None:
+    """Run the gate until asked to stop, then vent.
+
+    Raises:
+        Unavailable: the CAN bus cannot be opened.
+        Lost: it went away.
+    """
+    port = open_port(config.bus, config.valves.can, context.wire, context.clock, [can_frames.VALVE_STATUS_ID])
+    try:
+        loop = ValvesLoop(config, context, port)
+        context.enter_loop()
+        while not context.stop:
+            loop.wait()
+            loop.read()
+            loop.step()
+            loop.write()
+        loop.shut_down()
+    finally:
+        port.close()
+
+
+class ValvesLoop:
+    """The gate's wires, and what it keeps between two wakes."""
+
+    def __init__(self, config: ValvesProcess, context: Context, port: CanPort) -> None:
+        self.context, self.clock, self.port = context, context.clock, port
+        self.wait_ns = PERIOD_NS + round(config.valves.command_wait_ms * 1e6)
+        self.config = g.gate_config(config)
+        self.state, self.given, self.output = (new_record(d) for d in (g.GATE_STATE, g.GATE_INPUT, g.GATE_OUTPUT))
+        self.driver = can_frames.E2eReceiver(can_frames.VALVE_STATUS_ID, config.valves.driver_max_lost)
+        self.driver_frame = can_frames.ValveStatusFrame(0, 0, 0, 0, 0)
+        self.seq = self.tick = self.bus_offs = 0
+        self.said_driver, self.said_refusal, self.was_off = g.DRIVER_SILENT, 0, False
+        self.lost: Lost | None = None
+        self._warm()
+        self.commands, self.requests = context.wire.inbox(COMMAND), context.wire.inbox(REQUEST)
+        self.put = context.wire.publisher(VALVES)
+        self.status, self.events = StatusReporter(context, _SOURCE), EventReporter(context, _SOURCE)
+        self.began_ns = self.clock.now_ns()
+        self.deadline_ns = self.began_ns + PERIOD_NS
+
+    def _warm(self) -> None:
+        """Compile and load all that the loop uses, on records of its own."""
+        state, output = new_record(g.GATE_STATE), new_record(g.GATE_OUTPUT)
+        g.gate_step(self.config, state, self.given, output)
+        data = can_frames.encode_valve_command(can_frames.ValveCommandFrame(0, 0, 0, 0, 0))
+        can_frames.decode_valve_status(data)
+
+    def wait(self) -> None:
+        """Return at the next command, or at the deadline; notes which."""
+        self.given.command_new = 0
+        while not self.context.stop:
+            left_s = (self.deadline_ns - self.clock.now_ns()) * 1e-9
+            taken = self.commands.take(left_s) if left_s > 0 else None
+            now_ns = self.clock.now_ns()
+            if taken is not None:
+                if self._take_newest(taken[1], now_ns):
+                    return
+            elif now_ns >= self.deadline_ns:
+                self._be_silent(now_ns)
+                return
+
+    def _take_newest(self, payload: bytes, now_ns: int) -> bool:
+        payloads = [payload, *(p for _, p in self.commands.take_all())]
+        self.status.dropped += len(payloads) - 1
+        try:
+            command = _COMMAND.unpack(payloads[-1])
+        except BadPayload:
+            self.status.dropped += 1
+            return False
+        given = self.given
+        given.command_new, given.command_received_ns, given.command_seq = 1, now_ns, command.seq & _INT63
+        given.pressure_stamp_ns, given.inclination_stamp_ns = command.pressure_stamp_ns, command.inclination_stamp_ns
+        given.chamber_pressure_kpa, given.angle_deg = command.chamber_pressure_kpa, command.angle_deg
+        given.charge_current_ma, given.exhaust_current_ma = command.charge_current_ma, command.exhaust_current_ma
+        given.ready, self.tick = command.ready, command.tick
+        self.deadline_ns = now_ns + self.wait_ns
+        self.status.cycle()
+        return True
+
+    def _be_silent(self, now_ns: int) -> None:
+        late_ns = now_ns - self.deadline_ns
+        self.tick += 1
+        self.deadline_ns = self.deadline_ns + PERIOD_NS if late_ns < PERIOD_NS else now_ns + PERIOD_NS
+        self.status.cycle(late_ns=late_ns, skipped=late_ns // PERIOD_NS)
+
+    def read(self) -> None:
+        """Requests, and what the driver and the bus say."""
+        given = self.given
+        given.stop = given.disarm = given.arm = 0
+        for _, payload in self.requests.take_all():
+            try:
+                request = _REQUEST.unpack(payload)
+            except BadPayload:
+                self.status.dropped += 1
+                continue
+            given.stop |= request.action == _STOP
+            given.disarm |= request.action == _DISARM
+            if request.action == _ARM:
+                given.arm, given.arm_origin, given.arm_seq = 1, request.origin & _INT63, request.seq & _INT63
+        try:
+            self._read_bus()
+        except Lost as error:
+            self.lost = error
+        given.bus_off = self.lost is not None or self.port.bus_off or self.port.bus_offs != self.bus_offs
+        self.bus_offs = self.port.bus_offs
+
+    def _read_bus(self) -> None:
+        for _ in range(_FRAMES_AT_ONCE):
+            frame = self.port.recv(0.0)
+            if frame is None:
+                return
+            data = frame.data[: frame.dlc]
+            if frame.flags == 0 and frame.arbitration_id == can_frames.VALVE_STATUS_ID and self.driver.judge(data).usable:
+                self.driver_frame = can_frames.decode_valve_status(data)
+                watchdog = self.driver_frame.state != can_frames.STATE_OK
+                self.given.driver = g.DRIVER_WATCHDOG if watchdog else g.DRIVER_OK
+                self.given.driver_stamp_ns = min(frame.stamp_ns, self.clock.now_ns())
+
+    def step(self) -> None:
+        """The gate's judgement, now."""
+        self.given.now_ns = self.clock.now_ns()
+        g.gate_step(self.config, self.state, self.given, self.output)
+
+    def write(self) -> None:
+        """One valve frame, then the word on it. Raises Lost when the bus went away, after saying so on Zenoh."""
+        output = self.output
+        self.seq += 1
+        counts = int(output.charge_counts), int(output.exhaust_counts)
+        frame = can_frames.ValveCommandFrame(self.seq % can_frames.COUNTER_STATES, int(output.output), *counts, self.seq & 0xFFFF)
+        stamp_ns = self.clock.now_ns()
+        if self.lost is None:
+            try:
+                self.status.dropped += not self.port.send(
+                    can_frames.VALVE_COMMAND_ID, can_frames.encode_valve_command(frame), stamp_ns
+                )
+            except Lost as error:
+                self.lost = error
+        self._publish(stamp_ns)
+        self._say(stamp_ns)
+        if self.lost is not None:
+            raise self.lost
+
+    def _publish(self, stamp_ns: int) -> None:
+        given, output, driver = self.given, self.output, self.driver_frame
+        new = int(given.command_new)
+        status = _STATUS.make(
+            seq=self.seq,
+            stamp_ns=stamp_ns,
+            command_seq=int(given.command_seq) * new,
+            tick=self.tick,
+            command_received_ns=int(given.command_received_ns),
+            driver_stamp_ns=int(given.driver_stamp_ns),
+            charge_current_ma=float(output.charge_current_ma),
+            exhaust_current_ma=float(output.exhaust_current_ma),
+            charge_coil_ma=counts_to_current(driver.charge_counts),
+            exhaust_coil_ma=counts_to_current(driver.exhaust_counts),
+            rejected=self.driver.rejected,
+            gate=int(output.gate),
+            output=int(output.output),
+            reason=int(output.reason),
+            driver=int(output.driver),
+        )
+        self.put(_STATUS.pack(status))
+
+    def _say(self, stamp_ns: int) -> None:
+        """Events of this step, and lines for a person."""
+        output, at = self.output, {"stamp_ns": stamp_ns, "tick": self.tick}
+        if output.changed:
+            gate, reason = int(output.gate), int(output.reason)
+            self.events.say(_KIND_GATE, code=gate, reason=reason, **at)
+            say(self.context.process, f"gate {_GATES[gate]}" + (f": {_REASONS[reason]}" if reason else ""))
+            self.said_refusal = 0
+        if output.refused:
+            refused = int(output.refused)
+            self.events.say(_KIND_GATE, code=int(output.gate), reason=refused, **at)
+            if refused != self.said_refusal:
+                say(self.context.process, f"not armed: {_REASONS[refused]}")
+            self.said_refusal = refused
+        self._say_driver(int(output.driver), stamp_ns)
+        if bool(self.given.bus_off) != self.was_off:
+            self.was_off = not self.was_off
+            self.events.say(_KIND_BUS, code=1 if self.was_off else 0, **at)
+
+    def _say_driver(self, driver: int, stamp_ns: int) -> None:
+        bus = f"the valve driver on CAN bus '{self.port.name}'"
+        if driver != self.said_driver:
+            self.events.say(_KIND_DRIVER, stamp_ns, code=driver, tick=self.tick)
+            if driver == g.DRIVER_SILENT:
+                say(self.context.process, f"{bus} is silent; the gate stays or goes to a safe state")
+            self.said_driver = driver
+        elif driver == g.DRIVER_SILENT and self.began_ns and stamp_ns - self.began_ns > _PATIENCE_NS:
+            self.began_ns = 0
+            say(
+                self.context.process,
+                f"nothing is heard from {bus}; the gate will not arm. Is it powered, and the bus the right one?",
+            )
+
+    def shut_down(self) -> None:
+        """Disarm and send a few vent frames, so that one of them arrives."""
+        self.given.shutdown = 1
+        for _ in range(_SHUTDOWN_FRAMES):
+            self.given.command_new = 0
+            self.read()
+            self.step()
+            self.write()
+            self.clock.sleep_until_ns(self.clock.now_ns() + PERIOD_NS)
+        self.status.close()
