@@ -7,6 +7,7 @@ In every text value `{run_dir}` means the run directory and `{bench_dir}` the fo
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -16,8 +17,8 @@ from pydantic import Field, ValidationError
 
 from softloop.controller.config import ControllerConfig
 from softloop.deploy.config import RunConfig
-from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig
-from softloop.plant.config import PlantConfig
+from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig, pressures_process, valves_process
+from softloop.plant.config import PlantConfig, plant_process
 from softloop.watch.config import RecorderConfig
 from softloop.wire.benchfile import Table, load_model, read_toml
 from softloop.wire.can_config import CanConfig
@@ -26,8 +27,8 @@ from softloop.wire.errors import BadConfig, BadFile
 
 NAME = r"^[a-z0-9_-]{1,24}$"
 MAX_BASES = 8
-# Which keys name a CAN bus; each must be a [can.NAME] of the same bench.
-CAN_KEYS = (("plant", "can_valves"), ("plant", "can_analog"), ("valves", "can"), ("pressures", "can"))
+# In the order in which they are started; any order works.
+PROCESS_NAMES = ("recorder", "plant", "valves", "pressures", "inclinometer", "controller")
 
 Key = tuple[str, ...]
 
@@ -39,7 +40,7 @@ class Bench(Table):
     zenoh: ZenohConfig = ZenohConfig()
     host: HostConfig = HostConfig()
     run: RunConfig = RunConfig()
-    can: dict[str, CanConfig] = {}
+    can: dict[str, CanConfig] = Field(default_factory=dict)
     plant: PlantConfig | None = None
     valves: ValvesConfig | None = None
     pressures: PressuresConfig | None = None
@@ -113,19 +114,38 @@ def validate(source: Source) -> Bench:
     except ValidationError as error:
         where = tuple(str(part) for part in error.errors()[0]["loc"])
         return load_model(Bench, source.content, source.origin(where))  # says it in one line
-    _check_can_names(bench, source)
+    _check_together(bench, source)
     if source.run_dir is None:
         return bench
     # Default values may name the run directory too.
     return Bench.model_validate(_substituted(bench.model_dump(), source.file, source.run_dir))
 
 
-def _check_can_names(bench: Bench, source: Source) -> None:
-    for table, key in CAN_KEYS:
-        used = getattr(getattr(bench, table), key, None)
-        if used is not None and used not in bench.can:
-            known = ", ".join(sorted(bench.can)) or "none: add a [can.NAME] table"
-            raise BadConfig(f"{source.origin((table, key))}: key '{table}.{key}': no CAN bus '{used}'; there are: {known}")
+def process_config(bench: Bench, name: str) -> Any:
+    """What the `run` of process `name` is given. Raises BadConfig when its table does not agree with the others."""
+    table = getattr(bench, name)
+    if name == "plant":
+        return plant_process(table, bench.can)
+    if name == "pressures":
+        return pressures_process(table, bench.can)
+    if name == "valves":
+        if bench.pressures is None or bench.inclinometer is None:
+            raise BadConfig("key 'valves': the gate needs the tables [pressures] and [inclinometer] too")
+        return valves_process(table, bench.pressures, bench.inclinometer, bench.can)
+    return table
+
+
+def _check_together(bench: Bench, source: Source) -> None:
+    """Tables that each are right must also agree, such as on the names of CAN buses."""
+    for name in PROCESS_NAMES:
+        if getattr(bench, name) is None:
+            continue
+        try:
+            process_config(bench, name)
+        except BadConfig as error:
+            key = re.search(r"key '([^']+)'", str(error))
+            where = tuple(key[1].split(".")) if key else (name,)
+            raise BadConfig(f"{source.origin(where)}: {error}") from None
 
 
 def _chain(path: Path) -> list[tuple[Path, dict[str, Any]]]:

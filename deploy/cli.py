@@ -1,3 +1,4 @@
+# ruff: noqa: PLC0415 - every command imports what it needs, and no other command pays for it
 """The command line. Everything heavy is imported inside the commands, so that `softloop --help` and each process start fast."""
 
 from __future__ import annotations
@@ -91,9 +92,10 @@ def report(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory, or a log in it.")],
 ) -> int:
     """Compute summary and report of a run again, from its log."""
-    from softloop.deploy.conclude import report_again
+    from softloop.deploy.conclude import judge
 
-    return report_again(run)
+    judge(run, report=True, quiet=False)
+    return EXIT_OK
 
 
 @app.command()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,12 +16,12 @@ from softloop.deploy.conclude import conclude
 from softloop.deploy.gate_requests import Requests, ask
 from softloop.deploy.live import View, make_view
 from softloop.deploy.node import STOP_ORDER, processes_of
-from softloop.deploy.prepare import Interrupted, prepare_in_child
+from softloop.deploy.prepare import prepare_in_child
 from softloop.deploy.progress import compile_progress
 from softloop.deploy.rig_state import GATE_FAULT, RigState
 from softloop.deploy.router import launcher_wire, remove_sockets
 from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench, make_run_dir
-from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, BadConfig, Unavailable
+from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, BadConfig
 from softloop.wire.session import Wire
 from softloop.wire.shell import Stop
 
@@ -197,7 +197,7 @@ class Launch:
 
     def _vented(self, outcome: Outcome) -> Outcome:
         """Disarm and wait until the chamber's pressure is gone, or not much longer."""
-        if self.bench.valves is None or self.state.valves is None:
+        if not self.state.was_armed:  # the gate has vented by itself all the time
             return outcome
         deadline = time.monotonic() + self.bench.run.vent_timeout_s
         while time.monotonic() < deadline and not self._is_vented():

@@ -8,6 +8,14 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from rich.columns import Columns
+from rich.console import Console, Group
+from rich.live import Live
+from rich.panel import Panel
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
 from softloop.deploy.rig_state import GATES, OUTPUTS, PHASES, RigState
 
 PLAIN_EVERY_NS = 5_000_000_000
@@ -51,17 +59,18 @@ class Quiet:
 
 
 class PlainView:
-    """A line every few seconds, for logs and pipes."""
+    """A line at each new stage and every few seconds, for logs and pipes."""
 
     def __init__(self, trajectory_s: float, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._trajectory_s = trajectory_s
         self._now_ns = now_ns
         self._next_ns = 0
+        self._stage = ""
 
     def show(self, stage: str, state: RigState, alive: dict[str, str]) -> None:
         now_ns = self._now_ns()
-        if now_ns >= self._next_ns:
-            self._next_ns = now_ns + PLAIN_EVERY_NS
+        if now_ns >= self._next_ns or stage != self._stage:
+            self._stage, self._next_ns = stage, now_ns + PLAIN_EVERY_NS
             self.say(plain_line(stage, state, self._trajectory_s))
 
     def say(self, line: str) -> None:
@@ -101,9 +110,6 @@ class LiveView:
     """A panel that is drawn anew in place."""
 
     def __init__(self, trajectory_s: float) -> None:
-        from rich.console import Console
-        from rich.live import Live
-
         self._trajectory_s = trajectory_s
         self._events: deque[str] = deque(maxlen=EVENTS_SHOWN)
         self._live = Live(console=Console(), auto_refresh=False, transient=True)
@@ -121,19 +127,11 @@ class LiveView:
 
 def panel(stage: str, state: RigState, alive: dict[str, str], trajectory_s: float, events: list[str]) -> Any:
     """The whole picture, as a rich renderable."""
-    from rich.console import Group
-    from rich.panel import Panel
-    from rich.text import Text
-
     parts = [_bar(state, trajectory_s), _values(state), _processes(state, alive)]
     return Panel(Group(*parts, *(Text(line, style="dim") for line in events)), title=f"softloop: {stage}", title_align="left")
 
 
 def _bar(state: RigState, trajectory_s: float) -> Any:
-    from rich.columns import Columns
-    from rich.progress_bar import ProgressBar
-    from rich.text import Text
-
     at_s = 0.0 if state.cycle is None else max(0, state.cycle.trajectory_ns) * 1e-9
     total_s = max(trajectory_s, 1e-9)
     text = Text(f"{phase_of(state):<9}{at_s:6.1f} of {trajectory_s:.1f} s")
@@ -141,9 +139,6 @@ def _bar(state: RigState, trajectory_s: float) -> Any:
 
 
 def _values(state: RigState) -> Any:
-    from rich.table import Table
-    from rich.text import Text
-
     grid = Table.grid(padding=(0, 2))
     cycle, pressure = state.cycle, state.pressure
     if cycle is not None:
@@ -159,8 +154,6 @@ def _values(state: RigState) -> Any:
 
 
 def _processes(state: RigState, alive: dict[str, str]) -> Any:
-    from rich.table import Table
-
     grid = Table.grid(padding=(0, 2))
     for name, word in alive.items():
         status = state.statuses.get(name)

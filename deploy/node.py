@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
-from softloop.deploy.bench import Bench, load_bench
-from softloop.plant.config import plant_process
+from softloop.deploy.bench import PROCESS_NAMES, Bench, load_bench, process_config
 from softloop.wire.errors import BadConfig
 from softloop.wire.shell import Context, run_process
 
@@ -23,25 +20,23 @@ class Process:
         module: where its `run(config, context)` stands.
         realtime: it is on the 5 ms path and takes real-time priority where the machine grants it.
         source: the constant `SOURCE_*` of `Event.msg` by which it names itself in its `ProcessStatus`.
-        config: makes its config object from the bench.
     """
 
     name: str
     module: str
     realtime: bool
     source: str
-    config: Callable[[Bench], Any]
 
 
-# In the order in which they are started; any order works.
-PROCESSES = (
-    Process("recorder", "softloop.watch.recorder", False, "SOURCE_RECORDER", lambda bench: bench.recorder),
-    Process("plant", "softloop.plant.process", True, "SOURCE_PLANT", lambda bench: plant_process(bench.plant, bench.can)),
-    Process("valves", "softloop.devices.valves", True, "SOURCE_GATE", lambda bench: bench.valves),
-    Process("pressures", "softloop.devices.pressures", True, "SOURCE_PRESSURES", lambda bench: bench.pressures),
-    Process("inclinometer", "softloop.devices.inclinometer", True, "SOURCE_INCLINOMETER", lambda bench: bench.inclinometer),
-    Process("controller", "softloop.controller.process", True, "SOURCE_CONTROLLER", lambda bench: bench.controller),
+_KNOWN = (
+    Process("recorder", "softloop.watch.recorder", False, "SOURCE_RECORDER"),
+    Process("plant", "softloop.plant.process", True, "SOURCE_PLANT"),
+    Process("valves", "softloop.devices.valves", True, "SOURCE_GATE"),
+    Process("pressures", "softloop.devices.pressures", True, "SOURCE_PRESSURES"),
+    Process("inclinometer", "softloop.devices.inclinometer", True, "SOURCE_INCLINOMETER"),
+    Process("controller", "softloop.controller.process", True, "SOURCE_CONTROLLER"),
 )
+PROCESSES = tuple(sorted(_KNOWN, key=lambda process: PROCESS_NAMES.index(process.name)))
 # Together in each group. The gate vents while the plant still runs, and the recorder sees all of it.
 STOP_ORDER = (("controller",), ("valves",), ("pressures", "inclinometer", "plant"), ("recorder",))
 
@@ -70,7 +65,7 @@ def run_node(name: str, bench_file: Path, run_dir: Path, lifeline_fd: int | None
     process = find_process(bench, name)
 
     def body(context: Context) -> None:
-        import_module(process.module).run(process.config(bench), context)
+        import_module(process.module).run(process_config(bench, name), context)
 
     return run_process(
         name,

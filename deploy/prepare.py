@@ -69,7 +69,7 @@ def check_controller(bench: Bench) -> float:
     """
     if bench.controller is None:
         return 0.0
-    from softloop.controller.setup import build  # imports every kernel of the controller: only where it is needed
+    from softloop.controller.setup import build  # noqa: PLC0415 - it brings numba and scipy: only where it is needed
 
     return build(bench.controller).plan.duration_s
 
@@ -86,7 +86,7 @@ def prepare(bench: Bench, run_dir: Path, progress: Progress) -> Prepared:
 
 
 def _parameter_file(named: str) -> Path:
-    from softloop.dynamics.parameters import shipped
+    from softloop.dynamics.parameters import shipped  # noqa: PLC0415 - likewise
 
     return shipped(named) if shipped(named).is_file() else Path(named)
 
@@ -127,7 +127,9 @@ def _read_lines(lines: Any, progress: Progress, result: list[Prepared]) -> None:
 
 def _failure(code: int, log: Path) -> SoftloopError:
     lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-    failure = SoftloopError(lines[-1].removeprefix("softloop: ") if lines else "the bench cannot be prepared, and nothing says why")
+    failure = SoftloopError(
+        lines[-1].removeprefix("softloop: ") if lines else "the bench cannot be prepared, and nothing says why"
+    )
     failure.exit_code = code if code > 0 else EXIT_LOST
     return failure
 

@@ -6,6 +6,9 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from rich.console import Console
+from rich.progress import Progress
+
 
 @contextmanager
 def compile_progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
@@ -13,8 +16,6 @@ def compile_progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]
     if quiet or not sys.stderr.isatty():
         yield lambda module, done, total: None
         return
-    from rich.console import Console
-    from rich.progress import Progress
 
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("compiling kernels", total=None)

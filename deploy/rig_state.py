@@ -39,6 +39,7 @@ class RigState:
         self.pressure: Any = None
         self.statuses: dict[str, Any] = {}
         self.valves_heard_ns = 0
+        self.was_armed = False
 
     def refresh(self) -> list[str]:
         """Take what came since the last call; returns one line for each event in it."""
@@ -48,6 +49,7 @@ class RigState:
         if payload is not None:
             self.valves_heard_ns = time.monotonic_ns()
             self.valves = _newest(payload, "ValveStatus", self.valves)
+            self.was_armed |= self.valves is not None and self.valves.gate != GATE_DISARMED
         for _, payload in self._statuses.take_all():
             status = _newest(payload, "ProcessStatus", None)
             if status is not None and status.process in self._source_names:

@@ -38,7 +38,9 @@ def keep_bench(run_dir: Path, bench: Bench) -> Path:
     """Write the whole bench into the run's directory, every default included; returns the file."""
     file = run_dir / BENCH_FILE
     text = tomlkit.dumps(bench.model_dump(mode="json", exclude_none=True))
-    file.write_text(f"# The bench of this run: bases merged, defaults written out, addresses filled in.\n{text}", encoding="utf-8")
+    file.write_text(
+        f"# The bench of this run: bases merged, defaults written out, addresses filled in.\n{text}", encoding="utf-8"
+    )
     return file
 
 

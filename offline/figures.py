@@ -41,14 +41,14 @@ _STYLE: Any = {
     "legend.fontsize": 8.5,
     "lines.linewidth": 1.2,
 }
+_LATENESS_MARKS: Any = (("p50", "median", "-"), ("p99", "99 %", "--"), ("p99_9", "99.9 %", "-."), ("max", "maximum", ":"))
 _APPROACH = constant("CycleRecord", "PHASE_APPROACH")
 
 
 def _figure(height_in: float, rows: int, **options: Any) -> tuple[Figure, list[Axes]]:
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
-        FigureCanvasAgg(figure)
-        axes = figure.subplots(rows, 1, squeeze=False, **options)
+    figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, 1, squeeze=False, **options)
     return figure, list(axes[:, 0])
 
 
@@ -154,20 +154,24 @@ def _draw_errors(axis: Axes, log: Log, summary: dict[str, Any]) -> None:
             axis.plot(errors.time_s, errors.error_deg, color=color, linewidth=width, label=label)
             limit = max(limit, float(np.abs(errors.error_deg).max()))
     name, paper = paper_figures(summary)
-    for (controller, (dynamic, steady)), color in zip(paper.items(), (RED, ORANGE), strict=True):
-        _dashed(axis, dynamic, color, f"paper's {controller} on {name}: {dynamic}°")
+    for controller, color, above in (("ARC (C3)", RED, False), ("SMC (C2)", ORANGE, True)):
+        dynamic, steady = paper[controller]
+        _dashed(axis, dynamic, color, f"{controller[:3]} {dynamic:.2f}°", above=above)
         limit = max(limit, dynamic)
-        if steady is not None and controller.startswith("ARC"):
-            _dashed(axis, steady, GREEN, f"its steady error: {steady}°")
+        if steady is not None and not above:
+            _dashed(axis, steady, GREEN, f"ARC steady {steady:.2f}°", above=True)
     axis.set_ylim(-1.15 * limit, 1.15 * limit)
-    axis.set_title("(c)  Tracking error")
+    axis.set_title(f"(c)  Tracking error; dashed: the paper's largest on its {name}")
     axis.set_ylabel("error (°)")
     _legend(axis)
 
 
-def _dashed(axis: Axes, value: float, color: str, label: str) -> None:
-    axis.axhline(value, color=color, linewidth=0.9, linestyle=(0, (5, 3)), label=label)
-    axis.axhline(-value, color=color, linewidth=0.9, linestyle=(0, (5, 3)))
+def _dashed(axis: Axes, value: float, color: str, text: str, *, above: bool) -> None:
+    """A dashed line on both sides of zero, its text beside the upper one's right end."""
+    for side in (value, -value):
+        axis.axhline(side, color=color, linewidth=0.9, linestyle=(0, (5, 3)))
+    place: Any = {"xycoords": axis.get_yaxis_transform(), "va": "bottom" if above else "top", "fontsize": 7.5, "color": color}
+    axis.annotate(text, (1.008, value), **place)
 
 
 def _draw_currents(axis: Axes, cycles: Records, start_ns: int) -> None:
@@ -209,18 +213,14 @@ def lateness(log: Log, summary: dict[str, Any]) -> Figure:
     if late_ms.size:
         high = max(float(late_ms.max()), 0.1)
         axis.hist(late_ms, bins=np.linspace(min(0.0, float(late_ms.min())), high * 1.02, 80).tolist(), color=SKY, log=True)
-        for name, label in (("p50", "median"), ("p99", "99 %"), ("p99_9", "99.9 %"), ("max", "max")):
-            _mark_value(axis, (summary[f"tick_late_{name}_us"] or 0.0) * 1e-3, label)
-    axis.set_title(f"Tick lateness: woken less scheduled; {summary['ticks']} ticks, {summary['ticks_skipped']} skipped", pad=26)
+        for name, label, dashes in _LATENESS_MARKS:
+            value = summary[f"tick_late_{name}_us"] * 1e-3
+            axis.axvline(value, color=RED, linewidth=1.0, linestyle=dashes, label=f"{label} {value:.2f} ms")
+        axis.legend(loc="upper right", frameon=True, framealpha=1.0, edgecolor="none")
+    axis.set_title(f"Tick lateness: woken less scheduled; {summary['ticks']} ticks, {summary['ticks_skipped']} skipped")
     axis.set_xlabel("lateness (ms)")
     axis.set_ylabel("ticks")
     return figure
-
-
-def _mark_value(axis: Axes, value: float, label: str) -> None:
-    axis.axvline(value, color=RED, linewidth=0.8)
-    text = f"{label}\n{value:.2f}"
-    axis.annotate(text, (value, 1.01), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=7.5, color=RED)
 
 
 @_styled
@@ -246,8 +246,8 @@ def latency(log: Log, summary: dict[str, Any]) -> Figure:
     axis.set_ylabel("ms")
     axis.set_ylim(bottom=0.0)
     axis.margins(y=0.15)
-    axis.set_title("Latency from sensor to coil: column median, line 99th percentile")
-    axis.legend(loc="upper right")
+    axis.set_title("Latency from sensor to coil; column and number: median, line: 99th percentile")
+    axis.legend(loc="upper right", frameon=True, framealpha=1.0, edgecolor="none")
     return figure
 
 

@@ -110,14 +110,14 @@ def find_messages(data: Bytes, found: NDArray[np.int64]) -> int:
             return -1
         length = 0
         for k in range(7, -1, -1):
-            length = length * 256 + data[at + 1 + k]
+            length = length * 256 + int(data[at + 1 + k])
             if length > data.size:
                 return -1
         start = at + 9
         if start + length > data.size or (data[at] == 5 and length < 22):
             return -1
         found[n, 0] = data[at]
-        found[n, 1] = data[start] + 256 * data[start + 1] if data[at] == 5 else 0
+        found[n, 1] = int(data[start]) + 256 * int(data[start + 1]) if data[at] == 5 else 0
         found[n, 2] = start
         found[n, 3] = length
         n += 1

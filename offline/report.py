@@ -138,7 +138,8 @@ def _all_figures(summary: dict[str, Any]) -> str:
 
 def _figure_row(key: str, value: Any) -> str:
     place = "<td>" if isinstance(value, str) else '<td class="value">'
-    return f'<tr><td class="key">{_text(key)}</td>{place}{_text(shown(value, 3))}</td><td class="remark">{_text(MEANINGS[key])}</td></tr>'
+    meaning = f'<td class="remark">{_text(MEANINGS[key])}</td>'
+    return f'<tr><td class="key">{_text(key)}</td>{place}{_text(shown(value, 3))}</td>{meaning}</tr>'
 
 
 def _provenance(log: Log) -> str:

@@ -157,7 +157,7 @@ STATE = record_dtype(
         ("x", "f8", (N_STATES,)),
         ("stage", "f8", (N_STATES,)),
         ("slope", "f8", (N_STATES,)),
-        ("sum", "f8", (N_STATES,)),
+        ("next", "f8", (N_STATES,)),
         ("memory", MEMORY),
         ("command_charge_ma", "f8"),
         ("command_exhaust_ma", "f8"),

@@ -98,7 +98,7 @@ def from_message(msg: can.Message, seq: int, stamp_ns: int, node: int) -> CanFra
         raise ValueError(f"not a classic CAN frame: id {msg.arbitration_id:#x}, dlc {dlc}, flags {flags}")
     # An error frame may be built from its class alone (`dlc=8`, no data): its details are then zero.
     data = b"" if msg.is_remote_frame else bytes(msg.data)
-    if len(data) != dlc and not (flags & FLAG_REMOTE or (flags & FLAG_ERROR and not data)):
+    if len(data) != dlc and not (flags & FLAG_REMOTE or (flags & FLAG_ERROR and dlc == MAX_DLC and not data)):
         raise ValueError(f"the dlc is {dlc}, but there are {len(data)} bytes of data")
     return CanFrame(seq, stamp_ns, node, msg.arbitration_id, flags, dlc, data.ljust(MAX_DLC, b"\0"))
 

@@ -82,9 +82,7 @@ class FramePublisher:
         publisher.put(pack_frame(frame))
 
     def close(self) -> None:
-        for publisher in self._publishers.values():
-            with contextlib.suppress(zenoh.ZError):
-                publisher.undeclare()
+        """Withdraw the publishers, each once no `put` in another thread uses it any more."""
         self._publishers.clear()
 
 
@@ -255,7 +253,7 @@ class ZenohBus(can.BusABC):
         self._queue.close()
         self._publisher.close()
         for declared in (self._subscriber, self._answers):
-            with contextlib.suppress(zenoh.ZError):
+            with contextlib.suppress(zenoh.ZError, RuntimeError):  # two threads that shut down at once
                 declared.undeclare()
         self._close_own_session()
 

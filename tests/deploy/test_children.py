@@ -5,6 +5,7 @@ import sys
 import time
 
 import pytest
+
 from softloop.deploy.children import Children
 from softloop.wire.errors import EXIT_LOST
 

@@ -7,6 +7,7 @@ import threading
 from pathlib import Path
 
 import pytest
+
 from softloop.deploy.bench import load_bench
 from softloop.deploy.children import Children
 from softloop.deploy.launcher import Launch
@@ -28,6 +29,8 @@ realtime_priority = 0
 can = "can0"
 [pressures]
 can = "can0"
+[inclinometer]
+port = "/dev/null"
 [controller]
 """
 LIMITS = {"ready_timeout_s": 20.0, "arm_timeout_s": 3.0, "stop_timeout_s": 1.0}
@@ -59,7 +62,7 @@ def launch(run_dir, wrong, stop=None, **changes):
     keep_bench(run_dir, bench)
     view, children = Said(), Children(TOY)
     with launcher_wire(bench) as wire:
-        outcome = Launch(bench, run_dir, wire, view, stop or Stop(), children).run()
+        outcome = Launch(bench, run_dir, wire, view, Stop() if stop is None else stop, children).run()
     assert all(child.exit_code() is not None for child in children.all.values())
     assert sorted(p.name for p in run_dir.iterdir() if ".sock" in p.name) == []
     return outcome, view.lines, children
@@ -69,7 +72,7 @@ def test_a_run_ends_when_the_controller_is_done(short_dir):
     outcome, lines, children = launch(short_dir, {})
     assert outcome.code == EXIT_OK, outcome.text
     assert any(line.startswith("running, ") and "gate" in line for line in lines)
-    assert [c.exit_code() for c in children.all.values()] == [0, 0, 0]
+    assert [c.exit_code() for c in children.all.values()] == [0, 0, 0, 0]
     assert not any(c.killed for c in children.all.values())
 
 
@@ -112,7 +115,7 @@ def test_a_frozen_gate_is_noticed_and_killed(short_dir):
 
 
 def test_a_deaf_process_is_killed_and_its_socket_removed(short_dir):
-    outcome, lines, children = launch(short_dir, {"pressures": "deaf"})
+    outcome, _, children = launch(short_dir, {"pressures": "deaf"})
     assert outcome.code == EXIT_OK
     assert [name for name, child in children.all.items() if child.killed] == ["pressures"]
 
@@ -128,8 +131,8 @@ def test_an_interrupt_disarms_and_stops(short_dir):
 
 def test_two_launchers_of_one_bench_are_refused():
     name = f"t{os.getpid()}"
-    with bench_lock(name), pytest.raises(Unavailable, match=f"bench '{name}' is running already .launcher process {os.getpid()}"):
-        with bench_lock(name):
-            pass
+    said = f"bench '{name}' is running already .launcher process {os.getpid()}"
+    with bench_lock(name), pytest.raises(Unavailable, match=said), bench_lock(name):
+        pass
     with bench_lock(name):
         pass

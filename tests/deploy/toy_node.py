@@ -74,7 +74,7 @@ class Gate(Idle):
         self.put = self.wire.publisher(VALVES)
         self.requests = self.wire.inbox(REQUEST)
         self.gate = DISARMED
-        self.reason = 0
+        self.reason = self.armed_steps = 0
 
     def step(self):
         super().step()
@@ -82,10 +82,11 @@ class Gate(Idle):
             self.gate = {0: DISARMED, 1: ARMED, 2: FAULT}[message("GateRequest").unpack(payload).action]
         if self.gate == ARMED and self.wrong == "faults":
             self.gate, self.reason = FAULT, STALE
-        if self.gate == ARMED and self.wrong == "hangs_armed":
-            os.kill(os.getpid(), signal.SIGSTOP)
         kind = message("ValveStatus")
         self.put(kind.pack(kind.make(seq=self.seq, stamp_ns=self.clock.now_ns(), gate=self.gate, reason=self.reason)))
+        self.armed_steps += self.gate == ARMED
+        if self.armed_steps > 20 and self.wrong == "hangs_armed":
+            os.kill(os.getpid(), signal.SIGSTOP)
 
 
 class Pressures(Idle):

@@ -18,9 +18,10 @@ from mcap.reader import make_reader
 from softloop.watch import recorder as module
 from softloop.watch.config import RecorderConfig
 from softloop.watch.recorder import Sequence, Sink, run
+from softloop.wire.benchfile import load_model
 from softloop.wire.channels import CYCLE, EVENT, PRESSURE, STATUS, can_key, key
 from softloop.wire.config import ZenohConfig
-from softloop.wire.errors import Unavailable
+from softloop.wire.errors import BadConfig, Unavailable
 from softloop.wire.messages import message
 from softloop.wire.session import open_router, open_wire
 from softloop.wire.shell import Context
@@ -229,6 +230,12 @@ def test_when_the_disk_takes_nothing_for_long_new_messages_go_and_are_counted(tm
 def test_a_log_that_cannot_be_begun_is_said_before_the_run(tmp_path):
     with pytest.raises(Unavailable, match=r"none/run\.mcap: cannot be written: No such file"):
         Sink(tmp_path / "none" / "run.mcap")
+
+
+@pytest.mark.parametrize("name", ["../run.mcap", "run.txt", "a/b.mcap"])
+def test_the_log_stays_in_the_runs_directory(name):
+    with pytest.raises(BadConfig, match="key 'file'"):
+        load_model(RecorderConfig, {"file": name}, "bench.toml")
 
 
 def test_sequences():

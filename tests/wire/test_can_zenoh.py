@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import select
 import shutil
@@ -28,14 +27,11 @@ from softloop.wire.can_frame import (
     FLAG_REMOTE,
     FRAME_SIZE,
     CanFrame,
-    from_message,
     pack_frame,
-    to_message,
     unpack_frame,
 )
 from softloop.wire.can_zenoh import ZenohBus
 from softloop.wire.channels import can_key
-from softloop.wire.messages import message
 from softloop.wire.session import open_meeting
 
 BENCH = "t"
@@ -104,192 +100,6 @@ def standard(arbitration_id, data=b""):
 
 def drain(bus):
     return list(iter(lambda: bus.recv(0), None))
-
-
-# The same body over python-can's own virtual bus and ours: what is documented for all interfaces.
-
-
-@pytest.fixture(params=["virtual", "zenoh one session", "zenoh two sessions"])
-def pair(request, session):
-    opened: list[can.BusABC] = []
-
-    def start(**kwargs):
-        if request.param == "virtual":
-            arguments = {"interface": "virtual", "channel": "pair", "ignore_config": True}
-        elif request.param == "zenoh one session":
-            arguments = {"interface": "zenoh", "channel": "pair", "bench": BENCH, "session": session, "ignore_config": True}
-        else:
-            endpoint = f"unixsock-stream/{request.getfixturevalue('folder')}/m.sock"
-            arguments = {"interface": "zenoh", "channel": "pair", "endpoint": endpoint, "ignore_config": True}
-        opened.extend(can.Bus(**arguments, **kwargs) for _ in range(2))
-        return opened[-2:]
-
-    yield start
-    for bus in opened:
-        bus.shutdown()
-
-
-MESSAGES = [
-    standard(0x123, b"\x01\x02\x03"),
-    standard(0, b""),
-    standard(0x7FF, bytes(range(8))),
-    can.Message(arbitration_id=0x1FFFFFFF, is_extended_id=True, data=b"\xff"),
-    can.Message(arbitration_id=0x12, is_extended_id=True, data=b""),
-    can.Message(arbitration_id=0x55, is_extended_id=False, is_remote_frame=True, dlc=4),
-    can.Message(arbitration_id=0x155555, is_extended_id=True, is_remote_frame=True, dlc=8),
-    can.Message(arbitration_id=ERROR_BUS_OFF, is_extended_id=False, is_error_frame=True, dlc=8, data=bytes(8)),
-]
-
-
-def test_frames_of_every_kind_arrive_in_order_at_the_other_bus_only(pair):
-    a, b = pair()
-    for msg in MESSAGES:
-        a.send(msg)
-    for msg in MESSAGES:
-        got = b.recv(WAIT_S)
-        assert got is not None
-        assert got.equals(msg, timestamp_delta=None, check_channel=False)
-        assert got.is_rx
-    assert b.recv(0.05) is None
-    assert a.recv(0) is None
-
-
-def test_own_messages_come_back_only_when_asked_for(pair):
-    a, b = pair(receive_own_messages=True)
-    a.send(standard(1))
-    own, other = a.recv(WAIT_S), b.recv(WAIT_S)
-    assert (own.arbitration_id, own.is_rx) == (1, False)
-    assert (other.arbitration_id, other.is_rx) == (1, True)
-
-
-@pytest.mark.parametrize(
-    ("filters", "ids"),
-    [
-        (None, [0x10, 0x11, 0x20, 0x10, 0x7FF]),
-        ([], [0x10, 0x11, 0x20, 0x10, 0x7FF]),
-        ([{"can_id": 0x10, "can_mask": 0x7FF}], [0x10, 0x10]),
-        ([{"can_id": 0x10, "can_mask": 0x7FF, "extended": True}], [0x10]),
-        ([{"can_id": 0x10, "can_mask": 0x7F0, "extended": False}], [0x10, 0x11]),
-        ([{"can_id": 0x11, "can_mask": 0x7FF}, {"can_id": 0x20, "can_mask": 0x7FF}], [0x11, 0x20]),
-        ([{"can_id": 0x400, "can_mask": 0x400}], [0x7FF]),
-    ],
-)
-def test_filters(pair, filters, ids):
-    a, b = pair(can_filters=filters)
-    for msg in (standard(0x10), standard(0x11), standard(0x20), can.Message(arbitration_id=0x10, is_extended_id=True)):
-        a.send(msg)
-    a.send(standard(0x7FF))
-    got = [b.recv(WAIT_S).arbitration_id for _ in ids]
-    assert got == ids
-    assert b.recv(0.05) is None
-
-
-def test_a_filter_set_later_holds_for_frames_that_wait(pair):
-    a, b = pair()
-    for i in (1, 2, 3):
-        a.send(standard(i))
-    assert b.recv(WAIT_S).arbitration_id == 1
-    b.set_filters([{"can_id": 3, "can_mask": 0x7FF}])
-    assert b.recv(WAIT_S).arbitration_id == 3
-    assert b.recv(0) is None
-
-
-def test_timeouts_of_recv(pair):
-    a, b = pair()
-    assert b.recv(0) is None
-    start = time.monotonic()
-    assert b.recv(0.1) is None
-    assert time.monotonic() - start >= 0.09
-    threading.Timer(0.05, a.send, [standard(9)]).start()
-    assert b.recv().arbitration_id == 9
-
-
-def test_iteration_and_notifier_thread(pair):
-    a, b = pair()
-    a.send(standard(1))
-    assert next(iter(b)).arbitration_id == 1
-    reader = can.BufferedReader()
-    with can.Notifier(b, [reader], timeout=0.05):
-        a.send(standard(2))
-        assert reader.get_message(WAIT_S).arbitration_id == 2
-
-
-def test_notifier_with_asyncio(pair):
-    a, b = pair()
-
-    async def receive():
-        reader = can.AsyncBufferedReader()
-        notifier = can.Notifier(b, [reader], timeout=0.05, loop=asyncio.get_running_loop())
-        for i in range(5):
-            a.send(standard(i))
-        got = [(await asyncio.wait_for(reader.get_message(), WAIT_S)).arbitration_id for _ in range(5)]
-        notifier.stop()
-        return got
-
-    assert asyncio.run(receive()) == list(range(5))
-
-
-def test_send_periodic(pair):
-    a, b = pair()
-    task = a.send_periodic(standard(5), 0.005)
-    assert [b.recv(WAIT_S).arbitration_id for _ in range(3)] == [5, 5, 5]
-    task.stop()
-
-
-def test_shutdown_twice_and_what_follows(pair):
-    a, b = pair()
-    a.shutdown()
-    a.shutdown()
-    with pytest.raises(can.CanOperationError):
-        a.send(standard(1))
-    with pytest.raises(can.CanOperationError):
-        a.recv(0)
-    b.send(standard(1))  # nobody there: no error, no wait
-    assert b.state == can.BusState.ACTIVE
-
-
-# Ours alone.
-
-
-@given(
-    st.integers(0, 2**64 - 1), st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**29 - 1), st.binary(max_size=8), st.booleans()
-)
-def test_frame_bytes_are_those_of_the_message_definition(seq, stamp_ns, arbitration_id, data, remote):
-    flags = FLAG_EXTENDED | (FLAG_REMOTE if remote else 0)
-    frame = CanFrame(seq, stamp_ns, seq, arbitration_id, flags, len(data), data.ljust(8, b"\0"))
-    kind = message("CanFrame")
-    assert CanFrame._fields == kind.Tuple._fields
-    assert pack_frame(frame) == kind.pack(frame)
-    assert unpack_frame(pack_frame(frame)) == frame
-    there = kind.unpack(pack_frame(frame))
-    assert (*there[:-1], bytes(there.data)) == frame
-
-
-@given(
-    st.builds(
-        can.Message,
-        arbitration_id=st.integers(-5, 2**29 + 5),
-        is_extended_id=st.booleans(),
-        is_remote_frame=st.booleans(),
-        is_error_frame=st.booleans(),
-        dlc=st.none() | st.integers(-1, 10),
-        data=st.binary(max_size=10),
-        is_fd=st.booleans(),
-    )
-)
-def test_a_message_is_carried_as_it_is_or_refused(msg):
-    try:
-        frame = from_message(msg, 1, 2, 3)
-    except ValueError:
-        with pytest.raises(ValueError, match=".") if not msg.is_fd else pytest.raises(ValueError, match="FD"):
-            from_message(msg, 1, 2, 3)
-        return
-    assert unpack_frame(pack_frame(frame)) == frame
-    back = to_message(frame, "c", is_rx=True)
-    if msg.is_error_frame and not msg.data:
-        msg.data = bytearray(msg.dlc)
-    assert back.equals(msg, timestamp_delta=None, check_channel=False)
-    back._check()
 
 
 @given(st.binary(max_size=64) | st.binary(min_size=FRAME_SIZE, max_size=FRAME_SIZE))
@@ -380,6 +190,31 @@ def test_shutdown_wakes_a_blocked_recv(session):
     thread.join(WAIT_S)
     assert not thread.is_alive()
     assert len(ended) == 1
+
+
+def test_shutdown_while_others_send(session):
+    for _ in range(20):
+        bus = zenoh_bus(session)
+        faults: list[Exception] = []
+
+        def keep_sending(bus=bus, faults=faults):
+            try:
+                while True:
+                    bus.send(standard(1))
+            except can.CanOperationError:
+                pass
+            except Exception as error:  # noqa: BLE001 - whatever it is, the test shows it
+                faults.append(error)
+
+        threads = [threading.Thread(target=keep_sending) for _ in range(2)]
+        for thread in threads:
+            thread.start()
+        time.sleep(0.005)
+        bus.shutdown()
+        for thread in threads:
+            thread.join(WAIT_S)
+        assert not any(thread.is_alive() for thread in threads)
+        assert faults == []
 
 
 def test_fileno_is_readable_while_frames_wait(session):
@@ -480,7 +315,8 @@ def test_two_processes_with_no_other_argument_find_each_other(folder, monkeypatc
 
 def test_what_is_sent_just_before_shutdown_arrives(endpoint, echo):
     with can.Bus(interface="zenoh", channel="can0", bench=BENCH, endpoint=endpoint, ignore_config=True) as bus:
-        code = ECHO.split("print")[0] + "for i in range(200):\n    bus.send(can.Message(arbitration_id=i))\nbus.shutdown()"
+        code = ECHO.split("print", maxsplit=1)[0]
+        code += "for i in range(200):\n    bus.send(can.Message(arbitration_id=i))\nbus.shutdown()"
         subprocess.run([sys.executable, "-c", code, endpoint], check=True, timeout=30)
         assert [bus.recv(WAIT_S).arbitration_id for _ in range(200)] == list(range(200))
         assert (bus.lost, bus.dropped, bus.malformed) == (0, 0, 0)
@@ -524,5 +360,5 @@ def test_a_frozen_peer_holds_up_neither_open_nor_send_nor_shutdown(endpoint, ech
 
 
 def test_a_program_that_forgets_shutdown_ends(endpoint):
-    code = ECHO.split("print")[0] + "bus.send(can.Message(arbitration_id=1))"
+    code = ECHO.split("print", maxsplit=1)[0] + "bus.send(can.Message(arbitration_id=1))"
     assert subprocess.run([sys.executable, "-c", code, endpoint], timeout=30, check=False).returncode == 0

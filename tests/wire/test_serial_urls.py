@@ -174,7 +174,9 @@ def test_pty_can_be_opened_again(folder):
 
 
 def test_pty_link_of_a_killed_process_is_replaced(folder):
-    code = "import sys, serial, softloop.wire.serial_urls as s; p = s.open_serial(sys.argv[1], 9600, 1); print('up', flush=True); p.read(1)"
+    code = (
+        "import sys, softloop.wire.serial_urls as s; p = s.open_serial(sys.argv[1], 9600, 30); print('up', flush=True); p.read()"
+    )
     process = subprocess.Popen([sys.executable, "-c", code, f"pty://{folder}/p"], stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout.readline() == "up\n"
@@ -266,12 +268,11 @@ def test_what_cannot_be_opened_is_one_line(url, word):
 
 
 def test_ports_in_use_are_one_line(folder):
-    with open_serial("listen://127.0.0.1:0", 115200, 0.1) as ours:
-        with pytest.raises(Unavailable, match="in use"):
-            open_serial(f"listen://127.0.0.1:{ours.bound_port}", 115200, 0.1)
-    with open_serial(f"pty://{folder}/p", 115200, 0.1), open_serial(f"{folder}/p", 115200, 0.1):
-        with pytest.raises(Unavailable, match="in use by another process"):
-            open_serial(f"{folder}/p", 115200, 0.1)
+    with open_serial("listen://127.0.0.1:0", 115200, 0.1) as ours, pytest.raises(Unavailable, match="in use"):
+        open_serial(f"listen://127.0.0.1:{ours.bound_port}", 115200, 0.1)
+    path = f"{folder}/p"
+    with open_serial(f"pty://{path}", 115200, 0.1), open_serial(path, 115200, 0.1), pytest.raises(Unavailable, match="in use"):
+        open_serial(path, 115200, 0.1)
 
 
 @pytest.mark.parametrize("kind", ["pty", "listen"])
