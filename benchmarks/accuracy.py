@@ -93,9 +93,7 @@ class Oracle:
             value.terminal = True  # type: ignore[attr-defined]
             return value
 
-        found = solve_ivp(
-            self.slope, (0.0, left), x, method="DOP853", rtol=1e-10, atol=1e-11, events=[event(i) for i in crossed]
-        )
+        found = solve_ivp(self.slope, (0.0, left), x, method="DOP853", rtol=1e-10, atol=1e-11, events=[event(i) for i in crossed])
         gone = max(float(found.t[-1]), 1e-9)  # never stand still on the stop itself
         end = solve_ivp(self.slope, (0.0, gone), x, method="DOP853", rtol=1e-10, atol=1e-11)
         return end.y[:, -1], gone

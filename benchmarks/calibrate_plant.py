@@ -1,4 +1,4 @@
-"""Does the paper's own identification fit the simulated rig as well as it fitted the paper's?
+"""Whether the paper's own identification fits the simulated rig as well as it fitted the paper's.
 
 The pressure is imposed on the rig layer's mechanics alone, as a multi-sine over 5 to 110 kPa. Eq. 2 is fitted to 80 s of it in
 [0, 1] Hz by filtered least squares (Eqs. 6 to 10, m = 2, n = 0, r = 3), and then simulated freely, from the pressure alone, over

@@ -10,7 +10,15 @@ import numpy as np
 
 from softloop.dynamics.bending import pressure_for
 from softloop.dynamics.noise import gaussian, uniform
-from softloop.dynamics.parameters import KV1_CHARGE, KV1_EXHAUST, KV6_CHARGE, KV6_EXHAUST, MODEL, load_parameters, model_record, shipped
+from softloop.dynamics.parameters import (
+    KV1_CHARGE,
+    KV1_EXHAUST,
+    KV6_CHARGE,
+    KV6_EXHAUST,
+    load_parameters,
+    model_record,
+    shipped,
+)
 from softloop.dynamics.pneumatics import known_terms
 from softloop.dynamics.valve import current_for_area
 from softloop.plant.config import PlantConfig
@@ -64,7 +72,6 @@ def currents_for(model: Any, angle: float, rate: float, supply: float, pressure:
 
 def track(layer: str, seconds: float, seed: int = 1) -> Currents:
     """Let the crude controller run on a rig; what it sent."""
-    assert MODEL.names
     model = model_record(load_parameters(shipped()))
     config = PlantConfig.model_validate({"layer": layer, "seed": seed})
     params = plant_record(config)

@@ -20,7 +20,7 @@ from softloop.deploy.config import RunConfig
 from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig, pressures_process, valves_process
 from softloop.plant.config import PlantConfig, plant_process
 from softloop.watch.config import RecorderConfig
-from softloop.wire.benchfile import Table, load_model, read_toml
+from softloop.wire.benchfile import Table, load_model, read_toml, validated
 from softloop.wire.can_config import CanConfig
 from softloop.wire.config import HostConfig, ZenohConfig
 from softloop.wire.errors import BadConfig, BadFile
@@ -110,7 +110,7 @@ def load_bench(path: Path, run_dir: Path | None = None) -> Bench:
 def validate(source: Source) -> Bench:
     """The bench in `source`. Raises BadConfig as `load_bench` does."""
     try:
-        bench = Bench.model_validate(source.content)
+        bench = validated(Bench, source.content)
     except ValidationError as error:
         where = tuple(str(part) for part in error.errors()[0]["loc"])
         return load_model(Bench, source.content, source.origin(where))  # says it in one line

@@ -19,7 +19,6 @@ app = typer.Typer(
     name="softloop",
     help="Hardware-in-the-loop control of pneumatic soft bending actuators over Zenoh and CAN.",
     epilog=EXIT_CODES,
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -135,10 +134,11 @@ def prepare(bench: BenchArgument, run_dir: RunDir) -> int:
 
 def main(arguments: list[str] | None = None) -> None:
     """The entry point: every error is one line on standard error, and a documented exit code."""
-    sys.exit(_run(arguments))
+    given = sys.argv[1:] if arguments is None else arguments
+    sys.exit(_run(given or ["--help"]))
 
 
-def _run(arguments: list[str] | None) -> int:
+def _run(arguments: list[str]) -> int:
     try:
         code = app(arguments, standalone_mode=False)
     except SoftloopError as error:
@@ -150,7 +150,7 @@ def _run(arguments: list[str] | None) -> int:
         return EXIT_LOST
     except Exception as error:  # noqa: BLE001 - the last frame: a person gets one line
         if hasattr(error, "format_message"):  # click's own: a wrong argument or option
-            return _complain(error.format_message(), EXIT_USAGE)
+            return _complain(f"{error.format_message()} See softloop --help.", EXIT_USAGE)
         return _complain(f"stopped by a fault of its own: {error!r}", EXIT_LOST)
     return code if isinstance(code, int) else EXIT_OK
 

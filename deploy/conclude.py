@@ -9,9 +9,9 @@ from softloop.deploy.bench import Bench
 from softloop.wire.errors import EXIT_OK, SoftloopError
 
 
-def conclude(bench: Bench, run_dir: Path, code: int, text: str, *, quiet: bool) -> int:
-    """Summary and report of a run that ended with `code`, and a word on how it ended; returns the exit code."""
-    if bench.recorder is not None:
+def conclude(bench: Bench, run_dir: Path, code: int, text: str, *, began: bool, quiet: bool) -> int:
+    """Summary and report of a run that `began` and ended with `code`, and a word on how it ended; returns the exit code."""
+    if began and bench.recorder is not None:
         try:
             judge(run_dir / bench.recorder.file, report=bench.run.report, quiet=quiet)
         except SoftloopError as error:  # a log that cannot be judged changes nothing else

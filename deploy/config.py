@@ -15,6 +15,7 @@ class RunConfig(Table):
     folder: str = Field("runs", description="where run directories are made")
     duration_s: float = Field(0.0, ge=0, description="end after this time, armed; 0: when the controller is done")
     ready_timeout_s: float = Field(30.0, gt=0, description="every process must be alive by then")
+    settle_s: float = Field(0.5, ge=0, description="from all alive to arming: what starting up disturbed has passed by then")
     arm_timeout_s: float = Field(10.0, gt=0, description="the gate must be armed by then, after all are alive")
     vent_timeout_s: float = Field(3.0, ge=0, description="at the end, wait no longer than this for the chamber to vent")
     vented_kpa: float = Field(2.0, gt=0, description="gauge pressure under which the chamber counts as vented")

@@ -32,10 +32,11 @@ GATE_SILENT_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended."""
+    """How a run ended; `began` says that it came as far as an armed gate, or to a rig that needs none."""
 
     code: int
     text: str
+    began: bool = True
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def launch(bench_file: Path, options: Options) -> int:
             prepared = prepare_in_child(run_dir / BENCH_FILE, run_dir, stop, progress)
         with launcher_wire(bench) as wire, closing(make_view(prepared.trajectory_s, quiet=options.quiet)) as view:
             outcome = Launch(bench, run_dir, wire, view, stop, Children()).run()
-        return conclude(bench, run_dir, outcome.code, outcome.text, quiet=options.quiet)
+        return conclude(bench, run_dir, outcome.code, outcome.text, began=outcome.began, quiet=options.quiet)
 
 
 def _with_options(bench: Bench, options: Options) -> Bench:
@@ -116,7 +117,7 @@ class Launch:
         try:
             outcome = self._until_over()
             self._show("stopping")
-            return self._vented(outcome)
+            return replace(self._vented(outcome), began=self.state.was_armed or outcome.code == EXIT_OK)
         finally:
             self._stop_children()
 
@@ -156,6 +157,7 @@ class Launch:
         return ", ".join(f"{name} ({line})" if line else name for name, line in said.items())
 
     def _arm(self) -> Outcome | None:
+        self.stop.wait(self.bench.run.settle_s)
         limit = self.bench.run.arm_timeout_s
         armed = ask(self.requests, self.state, "arm", limit, give_up=lambda: self._trouble() is not None, on_event=self.view.say)
         if armed:

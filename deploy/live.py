@@ -85,8 +85,7 @@ def plain_line(stage: str, state: RigState, trajectory_s: float) -> str:
     parts = [stage]
     cycle = state.cycle
     if cycle is not None:
-        at_s = max(0, cycle.trajectory_ns) * 1e-9
-        parts += [f"{phase_of(state)} {at_s:.1f}/{trajectory_s:.1f} s", f"angle {cycle.angle_deg:.2f} deg"]
+        parts += [f"{phase_of(state)} {state.trajectory_s:.1f}/{trajectory_s:.1f} s", f"angle {cycle.angle_deg:.2f} deg"]
         parts += [f"reference {cycle.reference_deg:.2f}", f"error {cycle.error_deg:+.2f}"]
     if state.pressure is not None:
         parts.append(f"chamber {state.pressure.chamber_pressure_kpa:.1f} kPa")
@@ -132,10 +131,9 @@ def panel(stage: str, state: RigState, alive: dict[str, str], trajectory_s: floa
 
 
 def _bar(state: RigState, trajectory_s: float) -> Any:
-    at_s = 0.0 if state.cycle is None else max(0, state.cycle.trajectory_ns) * 1e-9
     total_s = max(trajectory_s, 1e-9)
-    text = Text(f"{phase_of(state):<9}{at_s:6.1f} of {trajectory_s:.1f} s")
-    return Columns([text, ProgressBar(total=total_s, completed=min(at_s, total_s), width=50)])
+    text = Text(f"{phase_of(state):<9}{state.trajectory_s:6.1f} of {trajectory_s:.1f} s")
+    return Columns([text, ProgressBar(total=total_s, completed=min(state.trajectory_s, total_s), width=50)])
 
 
 def _values(state: RigState) -> Any:

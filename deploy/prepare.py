@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module, resources
 from pathlib import Path
@@ -21,11 +21,12 @@ from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, SoftloopError
 from softloop.wire.shell import Stop
 
 PACKAGE = Path(__file__).resolve().parent.parent
-ROOMS = ("dynamics", "devices", "plant", "controller", "offline")
+RUN_ROOMS = ("dynamics", "devices", "plant", "controller")
+ROOMS = (*RUN_ROOMS, "offline")
 
 POLL_S = 0.05
 
-Progress = Callable[[str, int, int], None]
+Progress = Callable[[str, int, int], None]  # module, how many are done, how many there are
 
 
 class Interrupted(SoftloopError):
@@ -42,9 +43,9 @@ class Prepared:
     kernel_modules: int
 
 
-def kernel_modules(package: Path = PACKAGE) -> list[str]:
-    """Names of all modules that define kernels; rooms whose kernels others call come first."""
-    files = (f for room in ROOMS for f in sorted((package / room).rglob("*.py")))
+def kernel_modules(rooms: Sequence[str] = ROOMS, package: Path = PACKAGE) -> list[str]:
+    """Names of all modules of some rooms that define kernels; rooms whose kernels others call come first."""
+    files = (f for room in rooms for f in sorted((package / room).rglob("*.py")))
     return [_module_name(f, package) for f in files if "\n@kernel(" in f.read_text(encoding="utf-8")]
 
 
@@ -52,9 +53,9 @@ def _module_name(file: Path, package: Path) -> str:
     return ".".join(("softloop", *file.relative_to(package).with_suffix("").parts))
 
 
-def warm(progress: Progress = lambda module, done, total: None) -> int:
-    """Compile, or load from the cache, every kernel; returns how many modules. Calls `progress(module, done, total)`."""
-    modules = kernel_modules()
+def warm(progress: Progress, rooms: Sequence[str] = ROOMS) -> int:
+    """Compile, or load from the cache, all kernels of some rooms; returns how many modules. Calls `progress`."""
+    modules = kernel_modules(rooms)
     for done, name in enumerate(modules):
         progress(name, done, len(modules))
         import_module(name)
@@ -76,7 +77,7 @@ def check_controller(bench: Bench) -> float:
 
 def prepare(bench: Bench, run_dir: Path, progress: Progress) -> Prepared:
     """Warm, check, and put parameters and the CAN description beside the log. Raises as `check_controller` does."""
-    modules = warm(progress)
+    modules = warm(progress, RUN_ROOMS)
     trajectory_s = check_controller(bench)
     if bench.controller is not None:
         shutil.copyfile(_parameter_file(bench.controller.parameters), run_dir / "parameters.toml")

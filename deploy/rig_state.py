@@ -14,6 +14,7 @@ GATE_DISARMED = constant("ValveStatus", "GATE_DISARMED")
 GATE_ARMED = constant("ValveStatus", "GATE_ARMED")
 GATE_FAULT = constant("ValveStatus", "GATE_FAULT")
 OUTPUT_CLOSED = constant("ValveStatus", "OUTPUT_CLOSED")
+PHASE_TRACK = constant("CycleRecord", "PHASE_TRACK")
 PHASE_DONE = constant("CycleRecord", "PHASE_DONE")
 GATES = names_of("ValveStatus", "GATE_")
 OUTPUTS = names_of("ValveStatus", "OUTPUT_")
@@ -76,6 +77,12 @@ class RigState:
         """The controller says that its trajectory is over."""
         return self.cycle is not None and self.cycle.phase == PHASE_DONE
 
+    @property
+    def trajectory_s(self) -> float:
+        """Time on the trajectory, 0 before it begins."""
+        tracking = self.cycle is not None and self.cycle.phase in (PHASE_TRACK, PHASE_DONE)
+        return max(0, self.cycle.trajectory_ns) * 1e-9 if tracking else 0.0
+
     def vented(self, vented_kpa: float) -> bool:
         """The gate says that venting is over, or the chamber's pressure is gone."""
         if self.valves is not None and self.valves.gate != GATE_ARMED and self.valves.output == OUTPUT_CLOSED:
@@ -96,7 +103,8 @@ def reason_text(reason: int) -> str:
 def _event_text(event: Any) -> str:
     kind = _KINDS.get(event.kind, f"event {event.kind}")
     if kind == "gate":
-        return f"gate {GATES.get(event.code, event.code)} ({reason_text(event.reason)})"
+        why = f" ({reason_text(event.reason)})" if event.reason else ""
+        return f"gate {GATES.get(event.code, event.code)}{why}"
     if kind == "phase":
         return f"phase {PHASES.get(event.code, event.code)}"
     if kind == "load":

@@ -30,9 +30,7 @@ class ValvesConfig(Table):
     vent_current_ma: float = Field(200.0, gt=0, description="exhaust current while venting")
     vent_done_kpa: float = Field(2.0, ge=0, description="venting ends at this chamber pressure")
     vent_again_kpa: float = Field(10.0, gt=0, description="and begins again above this one")
-    vent_time_s: float = Field(
-        10.0, gt=0, description="venting ends after this time when no pressure above vent_again_kpa is known"
-    )
+    vent_time_s: float = Field(10.0, gt=0, description="or after this time, unless vent_again_kpa is seen")
     pressure_max_kpa: float = Field(190.0, gt=0, description="chamber pressure; above it is a fault")
     angle_min_deg: float = Field(-20.0, description="below it is a fault")
     angle_max_deg: float = Field(200.0, description="above it is a fault")
@@ -100,12 +98,8 @@ class InclinometerConfig(Table):
 
     @model_validator(mode="after")
     def _device_can_do_it(self) -> InclinometerConfig:
-        for name, codes in (
-            ("baud", BAUD_CODES),
-            ("configure_baud", BAUD_CODES),
-            ("rate_hz", RATE_CODES),
-            ("bandwidth_hz", BANDWIDTH_CODES),
-        ):
+        tables = {"baud": BAUD_CODES, "configure_baud": BAUD_CODES, "rate_hz": RATE_CODES, "bandwidth_hz": BANDWIDTH_CODES}
+        for name, codes in tables.items():
             value = getattr(self, name)
             if value is not None and value not in codes:
                 raise ValueError(f"{name} must be one of {', '.join(map(str, codes))} (got {value})")

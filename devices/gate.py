@@ -222,7 +222,7 @@ def condition(config: Any, state: Any, given: Any) -> int:
         return REASON_CONTROLLER_LOST
     if given.now_ns - state.command_received_ns >= config.silence_ns:
         return REASON_COMMAND_SILENT
-    return state.command_reason  # type: ignore[no-any-return]
+    return state.command_reason
 
 
 @kernel(types.b1(_STATE, types.i8, types.i8))
@@ -232,7 +232,7 @@ def arm_is_new(state: Any, origin: int, seq: int) -> bool:
         if state.arm_origin[i] == origin:
             newer = seq > state.arm_seq[i]
             state.arm_seq[i] = max(seq, state.arm_seq[i])
-            return newer  # type: ignore[no-any-return]
+            return newer
     i = state.requesters % REQUESTERS
     state.arm_origin[i], state.arm_seq[i] = origin, seq
     state.requesters += 1

@@ -67,7 +67,6 @@ class InclinometerLoop:
         self.put = context.wire.publisher(INCLINATION)
         self.status, self.events = StatusReporter(context, _SOURCE), EventReporter(context, _SOURCE)
         self.rate = RateWatch(config)
-        self.lost = source is None
 
     def turn(self) -> None:
         """Wait for bytes, publish what they bring, keep time. Raises Unavailable on a wrong rate from the start."""
@@ -104,7 +103,6 @@ class InclinometerLoop:
         self._note(lost=False)
 
     def _note(self, *, lost: bool) -> None:
-        self.lost = lost
         self.events.say(_KIND_BUS, self.clock.now_ns(), code=int(lost))
 
     def _publish(self, sample: wt931.Sample) -> None:

@@ -72,11 +72,10 @@ class PressuresLoop:
         chamber_kpa = _pressure(self.config.chamber, inputs.chamber_counts)
         in_range = _in_range(self.config.supply, supply_kpa) and _in_range(self.config.chamber, chamber_kpa)
         self.seq += 1
-        # The frame's own stamp, not the time of this line: frames may have waited for this process.
-        arrival_ns = min(frame.stamp_ns, received_ns)
         sample = _SAMPLE.make(
             seq=self.seq,
-            stamp_ns=arrival_ns - self.frame_ns,
+            # At the latest its time on the wire ago; earlier when its own stamp says that it has waited for this process.
+            stamp_ns=min(frame.stamp_ns, received_ns - self.frame_ns),
             received_ns=received_ns,
             published_ns=self.clock.now_ns(),
             supply_pressure_kpa=supply_kpa,

@@ -6,8 +6,6 @@ valve frame. What happens without it: the driver's watchdog vents.
 
 from __future__ import annotations
 
-from typing import Any
-
 from softloop.devices import gate as g
 from softloop.devices.config import PERIOD_NS, ValvesProcess
 from softloop.devices.protocols import can_frames

@@ -29,7 +29,7 @@ _TO_UNIT = 2.0**-53
 
 @kernel(_U8(_U8, _U8))
 def _times(a: np.uint64, b: np.uint64) -> np.uint64:
-    """a b modulo 2^64."""
+    """The product modulo 2^64."""
     low = (a & _LOW) * (b & _LOW)
     cross = (((a & _LOW) * (b >> _S32)) & _LOW) + (((a >> _S32) * (b & _LOW)) & _LOW)
     return (((low >> _S32) + cross & _LOW) << _S32) | (low & _LOW)
@@ -37,7 +37,7 @@ def _times(a: np.uint64, b: np.uint64) -> np.uint64:
 
 @kernel(_U8(_U8, _U8))
 def _plus(a: np.uint64, b: np.uint64) -> np.uint64:
-    """a + b modulo 2^64."""
+    """The sum modulo 2^64."""
     low = (a & _LOW) + (b & _LOW)
     return (((a >> _S32) + (b >> _S32) + (low >> _S32) & _LOW) << _S32) | (low & _LOW)
 

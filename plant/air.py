@@ -60,9 +60,10 @@ def _chamber_slopes(air: Any, state: Any, chamber_pa: float, line_kg_s: float) -
     flowing_k = air.wall_k if line_kg_s > 0.0 else gas_k
     heat_w = air.wall_w_k * (air.wall_k - gas_k)
     enthalpy = GAS_CONSTANT * flowing_k * line_kg_s
-    rise_pa = (air.exponent * (enthalpy - chamber_pa * growth) + (air.exponent - 1.0) * heat_w) / volume
+    per_volume = 1.0 / volume
+    rise_pa = (air.exponent * (enthalpy - chamber_pa * growth) + (air.exponent - 1.0) * heat_w) * per_volume
     slope[CHAMBER] = rise_pa / PA_PER_KPA
-    slope[GAS_K] = gas_k * ((rise_pa - GAS_CONSTANT * gas_k * line_kg_s / volume) / chamber_pa + growth / volume)
+    slope[GAS_K] = gas_k * ((rise_pa - GAS_CONSTANT * gas_k * line_kg_s * per_volume) / chamber_pa + growth * per_volume)
 
 
 @kernel(types.void(AIR_TYPE, VALVE_SHAPE_TYPE, STATE_TYPE, types.i8, _F8, _F8, _F8))
@@ -74,6 +75,7 @@ def _spool_slopes(
     pull = drive_m2 - shape.k_v3_m2_pa * upstream_pa + shape.k_v5_m2_pa * downstream_pa
     spring = area * (1.0 - shape.k_v2_pa * upstream_pa + shape.k_v4_pa * downstream_pa)
     push = air.spool_rad_s * (air.spool_rad_s * (pull - spring) - 2.0 * air.spool_damping * speed)
+    state.push[(place - AREA_IN) // 2] = push
     # Only what stood against a stop when the step began is held there: one that arrives goes on, and the step is divided.
     at_seat = state.x[place] <= 0.0 and area <= 0.0 and push <= 0.0
     at_end = state.x[place] >= shape.area_max_m2 and area >= shape.area_max_m2 and push >= 0.0
@@ -88,24 +90,9 @@ def rig_air_slopes(air: Any, state: Any, charge_ma: float, exhaust_ma: float) ->
     """The rig layer: writes the slopes of spools, supply, tube, chamber and gas temperature."""
     x, slope = state.stage, state.slope
     supply, block = x[SUPPLY], x[TUBE]
-    into, out = valve_flows(air, supply, block, min(x[AREA_IN], air.charge.area_max_m2), min(x[AREA_OUT], air.exhaust.area_max_m2))
-    block_pa = PA_PER_KPA * block + ATMOSPHERE_PA
-    chamber_pa = PA_PER_KPA * x[CHAMBER] + ATMOSPHERE_PA
-    line = air.tube_kg_s_pa2 * (block_pa - chamber_pa) * (block_pa + chamber_pa)
-    slope[SUPPLY] = (air.supply_kpa - air.supply_droop_kpa_s_kg * into - supply) * air.supply_rate
-    slope[TUBE] = GAS_CONSTANT * air.wall_k / (PA_PER_KPA * air.tube_volume_m3) * (into - out - line)
-    _chamber_slopes(air, state, chamber_pa, line)
-    supply_pa, block_gauge_pa = PA_PER_KPA * supply, PA_PER_KPA * block
-    _spool_slopes(air, air.charge, state, AREA_IN, air.k_v1_charge * charge_ma - air.k_v6_charge, supply_pa, block_gauge_pa)
-    _spool_slopes(air, air.exhaust, state, AREA_OUT, air.k_v1_exhaust * exhaust_ma - air.k_v6_exhaust, block_gauge_pa, 0.0)
-
-
-@kernel(types.void(AIR_TYPE, STATE_TYPE, _F8, _F8))
-def rig_air_slopes(air: Any, state: Any, charge_ma: float, exhaust_ma: float) -> None:
-    """The rig layer: writes the slopes of spools, supply, tube, chamber and gas temperature."""
-    x, slope = state.stage, state.slope
-    supply, block = x[SUPPLY], x[TUBE]
-    into, out = valve_flows(air, supply, block, min(x[AREA_IN], air.charge.area_max_m2), min(x[AREA_OUT], air.exhaust.area_max_m2))
+    into, out = valve_flows(
+        air, supply, block, min(x[AREA_IN], air.charge.area_max_m2), min(x[AREA_OUT], air.exhaust.area_max_m2)
+    )
     block_pa = PA_PER_KPA * block + ATMOSPHERE_PA
     chamber_pa = PA_PER_KPA * x[CHAMBER] + ATMOSPHERE_PA
     line = air.tube_kg_s_pa2 * (block_pa - chamber_pa) * (block_pa + chamber_pa)

@@ -50,7 +50,7 @@ class PlantConfig(Table):
     layer: Literal["ideal", "rig"] = "rig"
     seed: int = Field(1, ge=0, description="which specimen of a rig, and its noise")
     parameters: str = Field("table1", description="parameter file about which the rig is drawn: a path, or a shipped name")
-    step_us: int = Field(1000, ge=10, le=1000, description="longest integration step; pieces between events are shorter")
+    step_us: int = Field(500, ge=10, le=1000, description="longest integration step; pieces between events are shorter")
 
     can_valves: str = "can0"
     can_analog: str = "can0"

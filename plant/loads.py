@@ -25,9 +25,9 @@ def _combine(params: Any, state: Any) -> None:
     memory.payload_deg_s2, memory.contact_1_s2, memory.contact_deg = 0.0, 0.0, 0.0
     for i in range(MAX_LOADS):
         if state.load_on[i] and params.loads[i].kind == LOAD_PAYLOAD:
-            memory.payload_deg_s2 += params.loads[i].size
+            memory.payload_deg_s2 += params.loads[i].magnitude
         elif state.load_on[i] and params.loads[i].kind == LOAD_CONTACT:
-            memory.contact_1_s2, memory.contact_deg = params.loads[i].size, params.loads[i].angle_deg
+            memory.contact_1_s2, memory.contact_deg = params.loads[i].magnitude, params.loads[i].angle_deg
     memory.inertia = 1.0 + memory.payload_deg_s2 * (pi / 180.0) * params.mechanics.payload_arm_m / GRAVITY_M_S2
 
 
@@ -52,7 +52,7 @@ def change_loads(params: Any, state: Any, events: np.ndarray, n: int) -> int:
         if on != (state.load_on[i] != 0):
             state.load_on[i] = 1 if on else 0
             event = events[n]
-            event.kind, event.sample_ns, event.end_ns, event.value = EVENT_LOAD, state.t_ns, state.t_ns, plan.size
+            event.kind, event.sample_ns, event.end_ns, event.value = EVENT_LOAD, state.t_ns, state.t_ns, plan.magnitude
             event.raw[0], event.raw[1], event.raw[2], event.raw[3] = state.load_on[i], plan.kind, i, 0
             n += 1
     _combine(params, state)

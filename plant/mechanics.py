@@ -47,9 +47,7 @@ def creep(mechanics: Any, angle_deg: float, first_deg: float, second_deg: float,
     """What the three Prony terms add, deg/s2, each stretched from its own slowly following angle."""
     stiffness = mechanics.creep_stiffness
     return -(
-        stiffness[0] * (angle_deg - first_deg)
-        + stiffness[1] * (angle_deg - second_deg)
-        + stiffness[2] * (angle_deg - third_deg)
+        stiffness[0] * (angle_deg - first_deg) + stiffness[1] * (angle_deg - second_deg) + stiffness[2] * (angle_deg - third_deg)
     )
 
 

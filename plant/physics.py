@@ -47,9 +47,7 @@ def slopes(params: Any, state: Any, charge_ma: float, exhaust_ma: float) -> None
     x, slope = state.stage, state.slope
     angle, mechanics = x[ANGLE], params.mechanics
     slope[ANGLE] = x[RATE]
-    slope[RATE] = acceleration(
-        mechanics, state.memory, angle, x[RATE], x[CHAMBER], x[CREEP_0], x[CREEP_0 + 1], x[CREEP_0 + 2]
-    )
+    slope[RATE] = acceleration(mechanics, state.memory, angle, x[RATE], x[CHAMBER], x[CREEP_0], x[CREEP_0 + 1], x[CREEP_0 + 2])
     if params.rig:
         for i in range(N_CREEP):
             slope[CREEP_0 + i] = (angle - x[CREEP_0 + i]) * mechanics.creep_rate[i]
@@ -83,6 +81,7 @@ def _try(params: Any, state: Any, step_s: float, half_decay: float) -> None:
         state.stage[i] = state.x[i]
         state.next[i] = state.x[i]
     slopes(params, state, state.play_charge_ma, state.play_exhaust_ma)
+    state.push_before[0], state.push_before[1] = state.push[0], state.push[1]
     _next_stage(params, state, step_s / 6.0, 0.5 * step_s)
     slopes(params, state, middle_in, middle_out)
     _next_stage(params, state, step_s / 3.0, 0.5 * step_s)
@@ -118,7 +117,7 @@ def decay_over(step_s: float, lag_s: float) -> float:
 
 @kernel(types.void(PLANT_TYPE, STATE_TYPE, _F8, _F8))
 def step(params: Any, state: Any, step_s: float, half_decay: float) -> None:
-    """One step, divided where a spool reaches a stop: there it stays, without a bounce."""
+    """One step, divided where a spool reaches a stop, where it stays without a bounce, and where it leaves one."""
     left_s, half = step_s, half_decay
     _try(params, state, left_s, half)
     for _ in range(_MAX_STOPS_PER_STEP if params.rig else 0):
@@ -179,19 +178,20 @@ def _advance_smooth(params: Any, state: Any, span_s: float) -> None:
     half_decay = decay_over(0.5 * step_s, params.air.coil_lag_s)
     pressure_lag, device_lag = params.electrical.pressure_lag_s, state.inclinometer.lag_s
     pressure_decay, device_decay = decay_over(step_s, pressure_lag), decay_over(step_s, device_lag)
+    pressure_steps, device_steps = pressure_lag / step_s, device_lag / step_s
     for _ in range(count):
         supply, block, angle, rate = state.x[SUPPLY], block_kpa(params, state), state.x[ANGLE], state.x[RATE]
         step(params, state, step_s, half_decay)
-        x, sensor, n_lag = state.x, state.inclinometer, pressure_lag / step_s
-        state.sensed_supply_kpa = _follow(state.sensed_supply_kpa, supply, x[SUPPLY], pressure_decay, n_lag)
-        state.sensed_chamber_kpa = _follow(state.sensed_chamber_kpa, block, block_kpa(params, state), pressure_decay, n_lag)
-        sensor.angle_deg = _follow(sensor.angle_deg, angle, x[ANGLE], device_decay, device_lag / step_s)
-        sensor.rate_deg_s = _follow(sensor.rate_deg_s, rate, x[RATE], device_decay, device_lag / step_s)
+        x, sensor, block_now = state.x, state.inclinometer, block_kpa(params, state)
+        state.sensed_supply_kpa = _follow(state.sensed_supply_kpa, supply, x[SUPPLY], pressure_decay, pressure_steps)
+        state.sensed_chamber_kpa = _follow(state.sensed_chamber_kpa, block, block_now, pressure_decay, pressure_steps)
+        sensor.angle_deg = _follow(sensor.angle_deg, angle, x[ANGLE], device_decay, device_steps)
+        sensor.rate_deg_s = _follow(sensor.rate_deg_s, rate, x[RATE], device_decay, device_steps)
 
 
 @kernel(types.void(PLANT_TYPE, STATE_TYPE, _I8))
 def advance(params: Any, state: Any, to_ns: int) -> None:
-    """Bring the physics and the sensors' lags to `to_ns`, in steps of at most `params.step_ns`; also divided where a play slips."""
+    """Bring physics and sensor lags to `to_ns`, in steps of at most `params.step_ns`, divided also where a play slips."""
     if to_ns <= state.t_ns:
         return
     left_s, air = _NS * (to_ns - state.t_ns), params.air

@@ -12,6 +12,7 @@ N_CREEP = 3
 AREA_IN, SPEED_IN, AREA_OUT, SPEED_OUT = 9, 10, 11, 12  # orifice areas (m2) and their rates (m2/s)
 N_STATES = 13
 N_IDEAL = 3
+N_VALVES = 2
 N_STOPS = 4  # stop operators of the actuator's hysteresis
 MAX_LOADS = 16
 QUEUE = 256  # valve frames under way: 1.28 s of them at 200 Hz
@@ -98,7 +99,7 @@ ELECTRICAL = record_dtype(
         ("truth_period_ns", "i8"),
     ]
 )
-LOAD = record_dtype([("kind", "i8"), ("on_ns", "i8"), ("off_ns", "i8"), ("size", "f8"), ("angle_deg", "f8")])
+LOAD = record_dtype([("kind", "i8"), ("on_ns", "i8"), ("off_ns", "i8"), ("magnitude", "f8"), ("angle_deg", "f8")])
 PLANT = record_dtype(
     [
         ("mechanics", MECHANICS),
@@ -158,6 +159,8 @@ STATE = record_dtype(
         ("stage", "f8", (N_STATES,)),
         ("slope", "f8", (N_STATES,)),
         ("next", "f8", (N_STATES,)),
+        ("push", "f8", (N_VALVES,)),  # what acts on each spool in the last stage, m2/s2 of its area
+        ("push_before", "f8", (N_VALVES,)),  # in the step's first stage
         ("memory", MEMORY),
         ("command_charge_ma", "f8"),
         ("command_exhaust_ma", "f8"),

@@ -24,7 +24,6 @@ from softloop.plant.records import (
     LOAD_CONTACT,
     LOAD_PAYLOAD,
     N_CREEP,
-    PLANT,
     STATE,
     SUPPLY,
 )
@@ -101,7 +100,7 @@ def _fill_timing(electrical: Any, config: PlantConfig, wires: WireTimes, drawn: 
 def _fill_load(place: Any, load: LoadConfig) -> None:
     place.kind = LOAD_PAYLOAD if load.kind == "payload" else LOAD_CONTACT
     place.on_ns, place.off_ns = round(load.on_s * _S), round(load.off_s * _S)
-    place.size, place.angle_deg = load.size, load.angle_deg
+    place.magnitude, place.angle_deg = load.size, load.angle_deg
 
 
 def new_device(config: PlantConfig) -> InclinometerDevice:
@@ -146,6 +145,3 @@ def configure_inclinometer(params: Any, state: Any, device: InclinometerDevice) 
         state.next_inclinometer_ns = NEVER_NS
     elif inclinometer.period_ns != before_ns or state.next_inclinometer_ns == NEVER_NS:
         state.next_inclinometer_ns = state.reached_ns + inclinometer_period_ns(params.electrical, inclinometer.period_ns)
-
-
-__all__ = ["PERIOD_NS", "PLANT", "WireTimes", "configure_inclinometer", "new_device", "new_state", "plant_parameters", "plant_record"]

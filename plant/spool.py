@@ -1,4 +1,4 @@
-"""Where in a step a valve's spool reaches one of its two stops."""
+"""Where in a step a valve's spool reaches one of its two stops, or leaves it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from softloop.plant.records import AIR_TYPE, AREA_IN, AREA_OUT, STATE_TYPE
 from softloop.wire.kernel import kernel
 
 _F8, _I8 = types.f8, types.i8
+_SMALLEST_SHARE = 1e-4  # of a step: nearer to its beginning than this is at its beginning
 _BISECTIONS = 24  # of a step: far below what its error is worth
 
 
@@ -28,10 +29,23 @@ def crossing(start: float, start_slope: float, end: float, end_slope: float) -> 
     return high
 
 
+@kernel(_F8(_F8, _F8))
+def _turn(before: float, after: float) -> float:
+    """Where between 0 and 1 a push that grows straight from `before` to `after` changes its direction; 1: not within."""
+    if before * after >= 0.0:
+        return 1.0
+    share = before / (before - after)
+    return share if share > _SMALLEST_SHARE else 1.0
+
+
 @kernel(types.Tuple((_F8, _F8))(_F8, STATE_TYPE, _I8, _F8))
 def _stop_of(area_max_m2: float, state: Any, place: int, step_s: float) -> tuple[float, float]:
-    """(share of the step, stop) at which one spool, inside its stroke before the tried step, meets a stop; share 1: it does not."""
-    before, after = state.x[place], state.next[place]
+    """(share of the tried step, stop) at which one spool meets a stop or leaves the one it stands at; share 1: neither."""
+    before, after, valve = state.x[place], state.next[place], (place - AREA_IN) // 2
+    if before <= 0.0 and state.push_before[valve] < 0.0:
+        return _turn(state.push_before[valve], state.push[valve]), 0.0
+    if before >= area_max_m2 and state.push_before[valve] > 0.0:
+        return _turn(state.push_before[valve], state.push[valve]), area_max_m2
     if 0.0 <= after <= area_max_m2 or not 0.0 < before < area_max_m2:
         return 1.0, 0.0
     stop = 0.0 if after < 0.0 else area_max_m2
@@ -41,7 +55,7 @@ def _stop_of(area_max_m2: float, state: Any, place: int, step_s: float) -> tuple
 
 @kernel(types.Tuple((_F8, _I8, _F8))(AIR_TYPE, STATE_TYPE, _F8))
 def first_stop(air: Any, state: Any, step_s: float) -> tuple[float, int, float]:
-    """(share, place, stop) of the first stop that a spool meets in the tried step; share 1 where none does."""
+    """(share, place, stop) of the first such instant in the tried step; share 1 where there is none."""
     share_in, stop_in = _stop_of(air.charge.area_max_m2, state, AREA_IN, step_s)
     share_out, stop_out = _stop_of(air.exhaust.area_max_m2, state, AREA_OUT, step_s)
     if share_in <= share_out:

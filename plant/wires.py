@@ -114,7 +114,7 @@ class CanSide:
 
 
 def _time_before_end(bus: CanConfig) -> int:
-    """From a frame's stamp to its end: stamped when handed to a bus without a wire, and at its end where a real wire carries it."""
+    """From a frame's stamp to its end. Without a wire it is stamped when handed over; a real wire's port stamps it at its end."""
     return can_frame_ns(DLC, bus.bitrate) if bus.interface in _WITHOUT_WIRE else 0
 
 

@@ -37,6 +37,7 @@ CODE_STORAGE = 1  # the disk took nothing
 STATUS_S = 1.0
 _STORE_BYTES = 1 << 20
 _RETRY_S = 0.1
+_QUIET_PASSES = 3  # nothing came on so many passes: all that was sent has arrived
 
 
 class Sink:
@@ -263,9 +264,10 @@ class Recorder:
         """Write what is left, within `drain_s`, close the file and leave the account."""
         end = time.monotonic() + self.config.drain_s
         self.report()
-        time.sleep(self.config.poll_s)  # what others sent with their last breath is on its way
-        while self.take() and time.monotonic() < end:
-            pass
+        quiet = 0
+        while quiet < _QUIET_PASSES and time.monotonic() < end:
+            time.sleep(self.config.poll_s)  # what others sent with their last breath is on its way
+            quiet = 0 if self.take() else quiet + 1
         self.log.finish()
         self.store()
         while self.sink.waiting and time.monotonic() < end:

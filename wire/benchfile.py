@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
@@ -35,9 +36,17 @@ def read_toml(path: Path) -> dict[str, Any]:
 def load_model(model: type[T], content: dict[str, Any], path: Path | str) -> T:
     """Validate `content` as `model`. Raises BadConfig: one line with file, key, fault and the allowed values."""
     try:
-        return model.model_validate(content)
+        return validated(model, content)
     except ValidationError as error:
         raise BadConfig(f"{path}: {'; '.join(_say(model, e) for e in error.errors()[:3])}") from None
+
+
+def validated(model: type[T], content: dict[str, Any]) -> T:
+    """Validate TOML's content as it stands: a number in quotes is not a number. Raises pydantic's ValidationError.
+
+    By way of JSON, whose strict mode takes an array for a tuple and a whole number for a float, as TOML means them.
+    """
+    return model.model_validate_json(json.dumps(content, default=str), strict=True)
 
 
 def _say(model: type[BaseModel], error: Any) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +19,7 @@ if TYPE_CHECKING:  # reading a bench file needs none of these
     from softloop.wire.clock import Clock
     from softloop.wire.session import Wire
 
+_LOOK_AGAIN_S = 0.05
 _OWN_KEYS = ("interface", "channel", "bitrate", "can_filters", "session", "bench")
 
 
@@ -27,6 +30,7 @@ class CanConfig(Table):
     channel: str | int = Field("can0", description="the bus of that interface: can0, /dev/ttyACM0, PCAN_USBBUS1, ...")
     bitrate: int = Field(500_000, ge=10_000, le=1_000_000, description="bit/s")
     send_timeout_ms: float = Field(2.0, gt=0, le=1000, description="a frame the bus has not taken by then is given up")
+    open_wait_s: float = Field(0.0, ge=0, le=600, description="how long a device file that is not there yet is waited for")
     mirror: bool = Field(True, description="also publish the frames of a bus that is not on Zenoh, for the log")
     options: dict[str, Any] = Field(default_factory=dict, description="more arguments of the python-can interface")
 
@@ -62,10 +66,18 @@ def open_bus(config: CanConfig, wire: Wire, receive: Sequence[int] | None = None
     if config.interface not in can.VALID_INTERFACES:
         there = ", ".join(sorted(can.VALID_INTERFACES))
         raise Unavailable(f"CAN interface '{config.interface}' is not known; there are: {there}")
+    _wait_for_device(config)
     try:
         return can.Bus(**arguments)
     except Exception as error:  # noqa: BLE001 - each driver has errors of its own kind; a person gets one line
         raise Unavailable(f"CAN bus {config.interface}:{config.channel}: {one_line(error)}") from None
+
+
+def _wait_for_device(config: CanConfig) -> None:
+    """Until the device file that `channel` names is there, so that whoever makes it may start later."""
+    end = time.monotonic() + config.open_wait_s
+    while str(config.channel).startswith("/") and not os.path.exists(str(config.channel)) and time.monotonic() < end:
+        time.sleep(_LOOK_AGAIN_S)
 
 
 def open_port(config: CanConfig, name: str, wire: Wire, clock: Clock, receive: Sequence[int] | None = None) -> CanPort:

@@ -19,6 +19,7 @@ from softloop.wire.config import ZenohConfig
 from softloop.wire.errors import Unavailable
 
 UNIX = "unixsock-stream/"
+CLIENT_PATIENCE_MS = 10_000
 
 
 def make_config(
@@ -35,7 +36,8 @@ def make_config(
         "listen/timeout_ms": 0,
         "connect/endpoints": connect,
         "connect/exit_on_failure": False,
-        "connect/timeout_ms": 0 if mode != "client" else -1,
+        # A peer keeps trying in the background for ever (-1), also after a router went away; a client needs its router to open.
+        "connect/timeout_ms": CLIENT_PATIENCE_MS if mode == "client" else -1,
         # 20 to 100 ms: a router that came back is found again well within the 2 s a rig may be without one.
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
         "open/return_conditions/connect_scouted": False,

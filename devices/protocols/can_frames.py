@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from enum import IntEnum
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cantools
 
 from softloop.wire.errors import BadFile
 
 DBC_FILE = Path(__file__).resolve().parent / "rig.dbc"
-_DATABASE = cantools.database.load_file(DBC_FILE)
+_DATABASE: Any = cantools.database.load_file(DBC_FILE)
 _COMMAND = _DATABASE.get_message_by_name("VALVE_COMMAND")
 _STATUS = _DATABASE.get_message_by_name("VALVE_STATUS")
 _ANALOG = _DATABASE.get_message_by_name("ANALOG_INPUTS")

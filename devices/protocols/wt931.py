@@ -43,7 +43,7 @@ def encode_packet(kind: int, words: tuple[int, int, int, int]) -> bytes:
 class Parser:
     """Finds packets in a stream of bytes; counts all it throws away.
 
-    On a wrong sum or an unknown type it goes on one byte later, never eleven: a lost byte costs the packet it was in, not the next.
+    On a wrong sum or an unknown type it goes on one byte later, never eleven: a lost byte costs its own packet only.
 
     Attributes:
         taken: bytes fed. accepted: packets returned. skipped: bytes in no packet.
@@ -85,7 +85,7 @@ class Parser:
             self.bad_sum += 1
         else:
             _, kind, *words = _PACKET.unpack_from(buffer, at)
-            packets.append(Packet(kind, tuple(words), self.taken - len(buffer) + at + PACKET_BYTES))  # type: ignore[arg-type]
+            packets.append(Packet(kind, tuple(words), self.taken - len(buffer) + at + PACKET_BYTES))
             self.accepted += 1
             return PACKET_BYTES
         self.skipped += 1
@@ -123,13 +123,13 @@ class CommandParser:
         """(register, value) of each command that is complete with `data`."""
         buffer = self._rest + data
         found: list[tuple[int, int]] = []
-        at = buffer.find(b"\xff\xaa")
-        while at >= 0 and len(buffer) - at >= COMMAND_BYTES:
-            found.append((buffer[at + 2], buffer[at + 3] | buffer[at + 4] << 8))
-            at = buffer.find(b"\xff\xaa", at + COMMAND_BYTES)
-        if at < 0:
-            at = len(buffer) - 1 if buffer.endswith(b"\xff") and not found else len(buffer)
-        self._rest = buffer[at:]
+        at = 0
+        while (head := buffer.find(b"\xff\xaa", at)) >= 0 and len(buffer) - head >= COMMAND_BYTES:
+            found.append((buffer[head + 2], buffer[head + 3] | buffer[head + 4] << 8))
+            at = head + COMMAND_BYTES
+        if head < 0:
+            head = len(buffer) - buffer.endswith(b"\xff", at)  # the second byte of a head may be still to come
+        self._rest = buffer[head:]
         return found
 
 

@@ -33,7 +33,7 @@ can = "can0"
 port = "/dev/null"
 [controller]
 """
-LIMITS = {"ready_timeout_s": 20.0, "arm_timeout_s": 3.0, "stop_timeout_s": 1.0}
+LIMITS = {"ready_timeout_s": 20.0, "arm_timeout_s": 3.0, "stop_timeout_s": 1.0, "settle_s": 0.0}
 
 
 @pytest.fixture

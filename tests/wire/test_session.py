@@ -9,7 +9,7 @@ from softloop.wire.channels import CHANNELS, COMMAND, EVENT, PRESSURE, channel_o
 from softloop.wire.config import ZenohConfig
 from softloop.wire.errors import Unavailable
 from softloop.wire.messages import message
-from softloop.wire.session import Wire, make_config, open_meeting, open_router
+from softloop.wire.session import Wire, make_config, open_meeting, open_router, open_session
 from tests.wire.rendezvous import meeting, short_folder, two_wires
 
 PATIENCE_S = 10.0
@@ -137,3 +137,22 @@ def test_keys_belong_to_channels():
     assert channel_of_key("b", "softloop/b/can/can0/80").name == "can"
     assert channel_of_key("b", "softloop/c/command") is None
     assert channel_of_key("b", "softloop/b/alive/valves") is None
+
+
+@pytest.mark.parametrize("mode", ["peer", "client"])
+def test_a_process_may_start_before_its_router_and_outlive_it(mode):
+    with short_folder() as folder:
+        config = ZenohConfig(mode=mode, endpoint=f"unixsock-stream/{folder}/meet.sock")
+        opened = []
+        opener = threading.Thread(target=lambda: opened.append(open_session(config, "test", "early")))
+        opener.start()
+        time.sleep(0.3)
+        with open_router(config, "test") as router:
+            opener.join(PATIENCE_S)
+            wire = Wire(opened[0], "test", "early")
+            wire.declare_alive()
+            until(lambda: Wire(router, "test", "launcher").processes_alive(0.1) == {"early"})
+        time.sleep(0.3)
+        with open_router(config, "test") as router:
+            until(lambda: Wire(router, "test", "launcher").processes_alive(0.1) == {"early"})
+        opened[0].close()

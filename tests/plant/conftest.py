@@ -1,0 +1,6 @@
+"""The accuracy test and its benchmark share one file."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
