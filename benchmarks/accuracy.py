@@ -4,6 +4,9 @@
   and wherever a valve meets a stop;
 - rig layer, without noise: against itself at a twentieth of the step.
 
+Replayed currents control nothing: an error that was made once is carried along, and on some rigs grows, because the block's
+pressure pushes the charge valve open. The last column says by how much a small error at 0.5 s has grown at its worst.
+
     python benchmarks/accuracy.py [SECONDS]
 """
 
@@ -22,17 +25,18 @@ from softloop.dynamics.pneumatics import pressure_rate
 from softloop.dynamics.valve import g3, g4
 from softloop.plant.config import PlantConfig
 from softloop.plant.physics import advance
-from softloop.plant.records import ANGLE, CHAMBER
+from softloop.plant.records import ANGLE, CHAMBER, TUBE
 from softloop.plant.setup import new_device, new_state, plant_record
 
 SECONDS = 60.0
 STEPS_US = (1000.0, 500.0, 250.0, 100.0)
+NUDGED_FRAME, NUDGE_KPA = 100, 1e-5
 IDEAL_LIMITS = (1e-3, 1e-2)  # deg, kPa
 RIG_LIMITS = (5e-3, 5e-2)
 
 
-def replay(layer: str, currents: Currents, step_ns: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Angle (deg) and chamber pressure (kPa) at each frame's end, before it takes effect."""
+def replay(layer: str, currents: Currents, step_ns: int, seed: int = 1, nudge_kpa: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Angle (deg) and chamber pressure (kPa) at each frame's end, before it takes effect; at 0.5 s `nudge_kpa` is added."""
     config = PlantConfig.model_validate({"layer": layer, "seed": seed})
     params = plant_record(config)
     params.step_ns = step_ns
@@ -40,6 +44,9 @@ def replay(layer: str, currents: Currents, step_ns: int, seed: int = 1) -> tuple
     angle, pressure = np.zeros(len(currents.end_ns)), np.zeros(len(currents.end_ns))
     for n, end_ns in enumerate(currents.end_ns):
         advance(params, state, int(end_ns))
+        if n == NUDGED_FRAME:
+            state.x[CHAMBER] += nudge_kpa
+            state.x[TUBE] += nudge_kpa
         angle[n], pressure[n] = state.x[ANGLE], state.x[CHAMBER]
         apply(params, state, float(currents.charge_ma[n]), float(currents.exhaust_ma[n]))
     return angle, pressure
@@ -129,11 +136,13 @@ def main() -> None:
     print(f"rig layer against a twentieth of the step; wanted: under {RIG_LIMITS[0]:g} deg, {RIG_LIMITS[1]:g} kPa")
     for seed in (1, 2, 3):
         currents = track("rig", seconds, seed)
+        nudged = replay("rig", currents, 500_000, seed, NUDGE_KPA), replay("rig", currents, 500_000, seed)
+        growth = errors(*nudged)[1] / NUDGE_KPA
         for step_us in STEPS_US:
             step_ns = round(1e3 * step_us)
             truth = replay("rig", currents, step_ns // 20, seed)
             angle, pressure = errors(replay("rig", currents, step_ns, seed), truth)
-            print(f"  seed {seed}  step {step_us:6.0f} us   {angle:9.2e} deg   {pressure:9.2e} kPa")
+            print(f"  seed {seed}  step {step_us:6.0f} us   {angle:9.2e} deg   {pressure:9.2e} kPa   errors grow x{growth:.0f}")
 
 
 if __name__ == "__main__":

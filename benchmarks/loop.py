@@ -28,7 +28,11 @@ from softloop.offline.metrics import HOPS, latencies_us, lateness_us
 PERCENT = (50.0, 99.0, 99.9, 100.0)
 # How the rig's hops stand beside the chain's; the serial packet and the frame on the bus have no counterpart in software.
 SOFTWARE = ("adapter", "compute", "publish", "zenoh", "gate")
-UDP_HOPS = {"adapter": ("adapter_in", "adapter_out"), "compute": ("woken", "controller_out"), "zenoh": ("controller_out", "gate_in")}
+UDP_HOPS = {
+    "adapter": ("adapter_in", "adapter_out"),
+    "compute": ("woken", "controller_out"),
+    "zenoh": ("controller_out", "gate_in"),
+}
 UDP_HOPS |= {"gate": ("gate_in", "gate_out")}
 STAMPS = ("sent", "adapter_in", "adapter_out", "woken", "controller_out", "gate_in", "gate_out", "driver_in")
 
@@ -43,7 +47,17 @@ def measure_rig(bench: str, seconds: float) -> dict[str, Any]:
     """Run the bench for `seconds` and read lateness and latencies from its log."""
     with tempfile.TemporaryDirectory(prefix="sl-loop-") as folder:
         run_dir = Path(folder) / "run"
-        command = [sys.executable, "-m", "softloop.deploy.cli", "run", bench, "--run-dir", str(run_dir), "--duration", str(seconds)]
+        command = [
+            sys.executable,
+            "-m",
+            "softloop.deploy.cli",
+            "run",
+            bench,
+            "--run-dir",
+            str(run_dir),
+            "--duration",
+            str(seconds),
+        ]
         subprocess.run([*command, "--no-report", "--quiet"], check=True, timeout=seconds + 120)
         log = open_log(next(run_dir.glob("*.mcap")))
     cycles = log["cycle"]

@@ -107,8 +107,8 @@ def reference_at(kind: int, knots: Floats, table: Floats, time_s: float, point: 
     if kind == SINES:
         sines_at(table, time_s, point)
         return
-    stretch = np.searchsorted(knots, time_s, side="right") - 1
-    stretch = min(max(stretch, 0), table.shape[0] - 1)
+    after = int(np.searchsorted(knots, time_s, side="right"))
+    stretch = min(max(after - 1, 0), table.shape[0] - 1)
     polynomial_at(table[stretch], time_s - knots[stretch], point)
 
 
@@ -128,9 +128,7 @@ def _falling(k: int, d: int) -> float:
     return product
 
 
-def point_to_point(
-    angles_deg: tuple[float, ...] = T1_ANGLES_DEG, move_s: float = T1_MOVE_S, dwell_s: float = T1_DWELL_S
-) -> Plan:
+def point_to_point(angles_deg: tuple[float, ...] = T1_ANGLES_DEG, move_s: float = T1_MOVE_S, dwell_s: float = T1_DWELL_S) -> Plan:
     """T1: dwells at each angle, joined by moves that are at rest, to the third derivative, at both ends."""
     knots, rows = [0.0], []
     for index, angle in enumerate(angles_deg):

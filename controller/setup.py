@@ -15,7 +15,7 @@ from softloop.controller.feasibility import check_angle_plan, check_pressure_pla
 from softloop.controller.laws.arc import STEP1
 from softloop.controller.records import CONFIG, CONTROLLER_STATE, CYCLE, GAINS, INPUTS, LAW_PRESSURE, LAWS, MODE_HOLD, MODE_RULES
 from softloop.controller.references import Plan
-from softloop.controller.tick import SCRATCH, controller_tick
+from softloop.controller.tick import SCRATCH, controller_tick_of_arrays
 from softloop.dynamics.parameters import B0, Parameters, load_parameters, model_record, shipped
 from softloop.wire.errors import BadConfig
 from softloop.wire.kernel import new_record
@@ -26,26 +26,25 @@ MS = 1_000_000
 
 @dataclass
 class Controller:
-    """One controller, ready to tick: its records and its trajectory. `inputs` is filled from outside."""
+    """One controller, ready to tick: its records, each an array of one, and its trajectory. `inputs` is filled from outside."""
 
-    config: Any
-    model: Any
-    gains: Any
+    config: NDArray[Any]
+    model: NDArray[Any]
+    gains: NDArray[Any]
     plan: Plan
     inputs: NDArray[Any]
     state: NDArray[Any]
     cycle: NDArray[Any]
-    scratch: Any
-    first: Any
+    scratch: NDArray[Any]
+    first: NDArray[Any]
 
     def tick(self) -> Any:
         """Run one tick on `inputs`; returns the filled cycle record."""
-        plan, cycle = self.plan, self.cycle[0]
-        controller_tick(
-            self.config, self.model, self.gains, plan.knots, plan.table, self.inputs[0], self.state[0], self.scratch, self.first,
-            cycle,
+        controller_tick_of_arrays(
+            self.config, self.model, self.gains, self.plan.knots, self.plan.table, self.inputs, self.state, self.scratch,
+            self.first, self.cycle,
         )  # fmt: skip
-        return cycle
+        return self.cycle[0]
 
 
 def parameters_of(config: ControllerConfig) -> Parameters:
@@ -81,16 +80,22 @@ def build(config: ControllerConfig) -> Controller:
     state[0].theta[:] = model.theta
     state[0].mode = MODE_HOLD
     return Controller(
-        config=config_record(config, plan),
-        model=model,
-        gains=gains_record(config, model),
+        config=_array_of_one(config_record(config, plan)),
+        model=_array_of_one(model),
+        gains=_array_of_one(gains_record(config, model)),
         plan=plan,
         inputs=np.zeros(1, INPUTS),
         state=state,
         cycle=np.zeros(1, CYCLE),
-        scratch=new_record(SCRATCH),
-        first=new_record(STEP1),
+        scratch=np.zeros(1, SCRATCH),
+        first=np.zeros(1, STEP1),
     )
+
+
+def _array_of_one(record: Any) -> NDArray[Any]:
+    array = np.zeros(1, record.dtype)
+    array[0] = record
+    return array
 
 
 def config_record(config: ControllerConfig, plan: Plan) -> Any:

@@ -2,7 +2,8 @@
 
 Two keys at the top make one bench out of another. `base = "sim.toml"` takes over the tables of that file (found beside this
 one); what stands in this file replaces key by key what stands there. `without = ["plant"]` leaves out tables of the base.
-In every text value `{run_dir}` means the run directory and `{bench_dir}` the folder of the file it stands in.
+In every text value `{run_dir}` means the run directory, `{port}` a TCP port that follows from it, so that runs side by side
+do not meet on one, and `{bench_dir}` the folder of the file the text stands in.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 from pydantic import Field, ValidationError
 
@@ -27,6 +29,7 @@ from softloop.wire.errors import BadConfig, BadFile
 
 NAME = r"^[a-z0-9_-]{1,24}$"
 MAX_BASES = 8
+FIRST_PORT, PORTS = 20_000, 12_000
 # In the order in which they are started; any order works.
 PROCESS_NAMES = ("recorder", "plant", "valves", "pressures", "inclinometer", "controller")
 
@@ -99,7 +102,7 @@ def load_bench(path: Path, run_dir: Path | None = None) -> Bench:
 
     Args:
         path: the file.
-        run_dir: what `{run_dir}` becomes; without it the text stays as it is (enough to check a file).
+        run_dir: what `{run_dir}` and `{port}` become; without it they stay as they are (enough to check a file).
 
     Raises:
         BadFile, BadConfig: one line with file, key, fault and what is allowed.
@@ -214,4 +217,11 @@ def _substituted(value: Any, file: Path, run_dir: Path | None) -> Any:
     if not isinstance(value, str):
         return value
     value = value.replace("{bench_dir}", str(file.parent.resolve()))
-    return value if run_dir is None else value.replace("{run_dir}", str(run_dir.resolve()))
+    if run_dir is None:
+        return value
+    return value.replace("{run_dir}", str(run_dir.resolve())).replace("{port}", str(port_of(run_dir)))
+
+
+def port_of(run_dir: Path) -> int:
+    """The TCP port of a run: below those that Linux gives out by itself (32768 and above), the same for all its processes."""
+    return FIRST_PORT + crc32(str(run_dir.resolve()).encode()) % PORTS

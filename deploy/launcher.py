@@ -162,7 +162,8 @@ class Launch:
         armed = ask(self.requests, self.state, "arm", limit, give_up=lambda: self._trouble() is not None, on_event=self.view.say)
         if armed:
             return None
-        refused = Outcome(EXIT_NEGATIVE, f"the gate was not armed within {limit:g} s: {self.state.reason}")
+        said = self.children.all["valves"].last_line()
+        refused = Outcome(EXIT_NEGATIVE, f"the gate was not armed within {limit:g} s: {said or self.state.reason}")
         return self._trouble() or refused
 
     def _watch(self) -> Outcome:

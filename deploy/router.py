@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,8 @@ from softloop.wire.session import UNIX, Wire, open_router, open_session
 from softloop.wire.shell import Stop
 
 LAUNCHER = "launcher"
-POLL_S = 0.2
+POLL_S = 0.1
+JOIN_S = 3.0  # joining takes well under a tenth of a second
 
 
 @contextmanager
@@ -20,18 +22,28 @@ def launcher_wire(bench: Bench) -> Iterator[Wire]:
     """The launcher's end of a bench: it is the meeting point, or joins a shared one.
 
     Raises:
-        Unavailable: the address is in use, or the bench runs already at the shared meeting point.
+        Unavailable: the address is in use; or nobody is at the shared meeting point, or the bench runs there already.
     """
     shared = bench.run.shared_router
     session = open_session(bench.zenoh, bench.name, LAUNCHER) if shared else open_router(bench.zenoh, bench.name)
     with session:
         wire = Wire(session, bench.name, LAUNCHER)
-        running = wire.processes_alive() if shared else set()
-        if running:
-            where = bench.zenoh.meeting_point(bench.name)
-            raise Unavailable(f"bench '{bench.name}' is running already at {where}: {', '.join(sorted(running))}")
+        if shared:
+            _be_alone(wire, bench.zenoh.meeting_point(bench.name))
         wire.declare_alive()
         yield wire
+
+
+def _be_alone(wire: Wire, where: str) -> None:
+    """Wait for the router, and see that it knows nobody else of this bench."""
+    deadline = time.monotonic() + JOIN_S
+    while not wire.session.info.routers_zid():
+        if time.monotonic() >= deadline:
+            raise Unavailable(f"no router at {where}; start one with `softloop router`, or set [run] shared_router = false")
+        time.sleep(POLL_S)
+    running = wire.processes_alive()
+    if running:
+        raise Unavailable(f"bench '{wire.bench}' is running already at {where}: {', '.join(sorted(running))}")
 
 
 def remove_sockets(bench: Bench, pid: int) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numba import types
 
 from softloop.dynamics.parameters import THETA_TYPE
-from softloop.wire.kernel import array_of, kernel
+from softloop.wire.kernel import kernel
 
 _F8 = types.f8
 

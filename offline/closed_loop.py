@@ -122,11 +122,12 @@ def simulate_run(controller: ControllerConfig, plant: PlantConfig, loop_delay_ns
     built = build(controller)
     params = plant_record(plant)
     state = new_state(params, new_device(plant), 1_000_000_000)
-    ticks = (int(built.config.approach_ns) + built.plan.duration_ns) // PERIOD_NS
+    config, pending = built.config[0], new_record(PENDING)
+    ticks = (int(config.approach_ns) + built.plan.duration_ns) // PERIOD_NS
     cycles, truths = np.zeros(ticks, CYCLE), np.zeros(ticks, TRUTH)
     simulate(
-        built.config, built.model, built.gains, built.plan.knots, built.plan.table, built.inputs[0], built.state[0],
-        built.scratch, built.first, params, state, np.zeros(64, EVENT), new_record(PENDING), _wiring(plant, params, loop_delay_ns),
+        config, built.model[0], built.gains[0], built.plan.knots, built.plan.table, built.inputs[0], built.state[0],
+        built.scratch[0], built.first[0], params, state, np.zeros(64, EVENT), pending, _wiring(plant, params, loop_delay_ns),
         cycles, truths,
     )  # fmt: skip
     return Run(cycles, truths)

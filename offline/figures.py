@@ -41,6 +41,7 @@ _STYLE: Any = {
     "legend.fontsize": 8.5,
     "lines.linewidth": 1.2,
 }
+_LATENESS_LEAST_MS = 0.001  # shown as this: ticks on time to the clock's grain, and early ones
 _LATENESS_MARKS: Any = (("p50", "median", "-"), ("p99", "99 %", "--"), ("p99_9", "99.9 %", "-."), ("max", "maximum", ":"))
 _APPROACH = constant("CycleRecord", "PHASE_APPROACH")
 
@@ -207,14 +208,16 @@ def pressures(log: Log, summary: dict[str, Any]) -> Figure:
 
 @_styled
 def lateness(log: Log, summary: dict[str, Any]) -> Figure:
-    """How late ticks woke: a histogram with counts on a logarithmic axis."""
+    """How late ticks woke: a histogram, both axes logarithmic, because what matters is the rare late one."""
     figure, [axis] = _figure(2.9, 1)
-    late_ms = metrics.lateness_us(log) * 1e-3
+    late_ms = np.maximum(metrics.lateness_us(log) * 1e-3, _LATENESS_LEAST_MS)
     if late_ms.size:
-        high = max(float(late_ms.max()), 0.1)
-        axis.hist(late_ms, bins=np.linspace(min(0.0, float(late_ms.min())), high * 1.02, 80).tolist(), color=SKY, log=True)
+        edges = np.geomspace(0.9 * float(late_ms.min()), 1.1 * float(late_ms.max()), 90)
+        axis.hist(late_ms, bins=edges.tolist(), color=SKY, log=True)
+        axis.set_xscale("log")
+        axis.xaxis.set_major_formatter("{x:g}")
         for name, label, dashes in _LATENESS_MARKS:
-            value = summary[f"tick_late_{name}_us"] * 1e-3
+            value = max(summary[f"tick_late_{name}_us"] * 1e-3, _LATENESS_LEAST_MS)
             axis.axvline(value, color=RED, linewidth=1.0, linestyle=dashes, label=f"{label} {value:.2f} ms")
         axis.legend(loc="upper right", frameon=True, framealpha=1.0, edgecolor="none")
     axis.set_title(f"Tick lateness: woken less scheduled; {summary['ticks']} ticks, {summary['ticks_skipped']} skipped")

@@ -45,7 +45,7 @@ class Plant:
         self._status = StatusReporter(context, SOURCE)
         self._reporter = EventReporter(context, SOURCE)
         self._late_max_ns = self._misses = 0
-        self._state = self._begin(self._clock.now_ns())
+        self.start()
 
     def _begin(self, start_ns: int) -> Any:
         return new_state(self._params, self._device, start_ns)
@@ -55,8 +55,9 @@ class Plant:
         run_until(self._params, self._begin(0), 2 * PERIOD_NS, self._events)
 
     def start(self) -> None:
-        """Set the rig's clock to now: at rest, vented."""
+        """Let the rig's time begin now: at rest, vented."""
         self._state = self._begin(self._clock.now_ns())
+        self._next_ns = int(self._state.next_truth_ns)
 
     def turn(self) -> None:
         """Read, update, write, keep time."""
@@ -66,7 +67,7 @@ class Plant:
         self._late_max_ns = max(self._late_max_ns, late_ns)
         self._misses += late_ns > LATE_NS
         self._status.cycle(late_ns)
-        self._clock.sleep_until_ns(min(next_event_ns(self._params, self._state), self._outbox.next_ns))
+        self._clock.sleep_until_ns(min(self._next_ns, self._outbox.next_ns))
 
     def close(self) -> None:
         self._serial.close()
@@ -75,26 +76,24 @@ class Plant:
 
     def _let_happen(self, now_ns: int) -> int:
         """Bring the rig to `now_ns`; returns how late the first happening was noticed."""
-        late_ns = max(0, now_ns - next_event_ns(self._params, self._state))
-        state = self._state
-        while state.reached_ns < now_ns:
-            count = run_until(self._params, state, now_ns, self._events)
-            for event in self._events[:count]:
-                self._take(event)
+        late_ns = max(0, now_ns - self._next_ns)
+        while self._state["reached_ns"] < now_ns:
+            count = run_until(self._params, self._state, now_ns, self._events)
+            for kind, sample_ns, end_ns, raw, value in self._events[:count].tolist():
+                self._take(kind, sample_ns, end_ns, raw.tolist(), value)
+        self._next_ns = int(next_event_ns(self._params, self._state))
         return late_ns
 
-    def _take(self, event: Any) -> None:
-        kind = int(event["kind"])
+    def _take(self, kind: int, sample_ns: int, end_ns: int, raw: list[int], value: float) -> None:
         if kind == EVENT_TRUTH:
             self._publish_truth()
             self._serial.listen(self._params, self._state, self._outbox)
         elif kind == EVENT_LOAD:
-            on, load, *_ = event["raw"].tolist()
-            self._reporter.say(KIND_LOAD, int(event["sample_ns"]), code=on, reason=load, value=float(event["value"]))
+            self._reporter.say(KIND_LOAD, sample_ns, code=raw[0], reason=raw[1], value=value)
         elif kind == EVENT_DRIVER:
-            self._reporter.say(KIND_DRIVER, int(event["sample_ns"]), code=int(event["raw"][0]))
+            self._reporter.say(KIND_DRIVER, sample_ns, code=raw[0])
         else:
-            self._outbox.add(int(event["end_ns"]), kind, event["raw"].tolist())
+            self._outbox.add(end_ns, kind, raw)
 
     def _publish_truth(self) -> None:
         truth = self._state.truth

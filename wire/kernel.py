@@ -11,7 +11,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Literal, TypeVar, cast
 
 import llvmlite.binding as llvm
 import numba
@@ -80,7 +80,7 @@ def record_type(dtype: np.dtype[Any]) -> Any:
     return numba.from_dtype(dtype)
 
 
-def array_of(element: Any, dimensions: int = 1, layout: str = "C") -> Any:
+def array_of(element: Any, dimensions: int = 1, layout: Literal["C", "A"] = "C") -> Any:
     """The numba type of an array of `element`; layout "A" also takes an array that is a field of a record."""
     return types.Array(element, dimensions, layout)
 

@@ -26,7 +26,7 @@ from softloop.controller.records import (
 )
 from softloop.controller.robust import SMOOTH, adapted, projected_rate, robust_term
 from softloop.dynamics.bending import bending_drift, drift_slope_angle, drift_slope_rate, fill_phi_a
-from softloop.dynamics.parameters import THETA_TYPE, B0, KV1_CHARGE, KV1_EXHAUST, KV6_CHARGE, KV6_EXHAUST, LEAK, MODEL_TYPE
+from softloop.dynamics.parameters import B0, KV1_CHARGE, KV1_EXHAUST, KV6_CHARGE, KV6_EXHAUST, LEAK, MODEL_TYPE, THETA_TYPE
 from softloop.dynamics.pneumatics import known_terms
 from softloop.wire.kernel import kernel, record_dtype, record_type
 
@@ -53,9 +53,7 @@ def mechanics_bound(model: Any, angle_deg: float, rate_deg_s: float) -> tuple[fl
 
 
 @kernel(types.void(MODEL_TYPE, ARC_GAINS_TYPE, THETA_TYPE, THETA_TYPE, MEASUREMENT_TYPE, REFERENCE_TYPE, STEP1_TYPE))
-def first_step(
-    model: Any, gains: Any, theta: np.ndarray, phi: np.ndarray, measurement: Any, reference: Any, out: Any
-) -> None:
+def first_step(model: Any, gains: Any, theta: np.ndarray, phi: np.ndarray, measurement: Any, reference: Any, out: Any) -> None:
     """Eqs. 33 to 39: S1, P_vd and its partial derivatives; fills phi_b into the first nine places of `phi`."""
     y, v = measurement.angle_deg, measurement.rate_deg_s
     error = y - reference.value
@@ -106,9 +104,7 @@ def estimate_rate_term(model: Any, gains: Any, state: Any, measurement: Any, fir
 
 
 @kernel(_F8(MODEL_TYPE, ARC_GAINS_TYPE, STATE_TYPE, MEASUREMENT_TYPE, STEP1_TYPE, _F8, _F8, types.i8))
-def second_step(
-    model: Any, gains: Any, state: Any, measurement: Any, first: Any, nominal: float, s2: float, mode: int
-) -> float:
+def second_step(model: Any, gains: Any, state: Any, measurement: Any, first: Any, nominal: float, s2: float, mode: int) -> float:
     """Eqs. 44 to 48 in an open mode: the flow asked of the valve, kPa/s; fills the valve's places of tau.
 
     `nominal` is the flow of I_ia (Eq. 45). I_is1 and I_is2 are divided by theta_10min, so their flow grows by theta_10 over it.

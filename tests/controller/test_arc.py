@@ -164,4 +164,3 @@ def test_without_leave_to_adapt_nothing_moves(state, shares):
     measurement.adapt = 0
     after, _, _, before = step(measurement, reference, shares, gains())
     assert after.theta.tolist() == before.tolist()
-

@@ -5,7 +5,16 @@ from hypothesis import strategies as st
 
 from softloop.controller import references
 from softloop.controller.config import ControllerConfig
-from softloop.controller.references import T1_ANGLES_DEG, T2_SPAN_DEG, excitation, from_csv, multi_sine, point_to_point, smooth_move, t2
+from softloop.controller.references import (
+    T1_ANGLES_DEG,
+    T2_SPAN_DEG,
+    excitation,
+    from_csv,
+    multi_sine,
+    point_to_point,
+    smooth_move,
+    t2,
+)
 from softloop.controller.setup import build, plan_of
 from softloop.controller.tick import move_between
 from softloop.wire.errors import BadConfig, BadFile
@@ -103,7 +112,11 @@ def test_trajectories_that_do_not_fit_the_law_are_refused():
 
 @pytest.mark.parametrize(
     ("low", "high", "hz", "word"),
-    [(15.0, 60.0, 0.2, "without pressure the actuator rests at 26.7"), (50.0, 130.0, 2.5, "kPa"), (100.0, 320.0, 0.1, "the supply of")],
+    [
+        (15.0, 60.0, 0.2, "without pressure the actuator rests at 26.7"),
+        (50.0, 130.0, 2.5, "kPa"),
+        (100.0, 320.0, 0.1, "the supply of"),
+    ],
 )
 def test_an_infeasible_reference_says_where_and_why(tmp_path, low, high, hz, word):
     plan = multi_sine((hz,), (low, high), 20.0, 1)

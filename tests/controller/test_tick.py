@@ -33,7 +33,7 @@ def controller(request):
 
 
 def test_it_waits_until_armed_with_valid_inputs_then_approaches_tracks_and_ends(controller):
-    controller.config.plan_ns = 20 * PERIOD_NS
+    controller.config[0].plan_ns = 20 * PERIOD_NS
     assert fed(controller, 0, armed=False).phase == r.PHASE_WAIT
     assert fed(controller, 1, status=1).phase == r.PHASE_WAIT
     phases = [int(fed(controller, k).phase) for k in range(2, 50)]
@@ -81,7 +81,7 @@ def test_one_valve_works_at_a_time_and_currents_stay_in_range(controller):
         assert 0.0 <= cycle.exhaust_current_ma <= 220.0
         closed = {r.MODE_CHARGE: cycle.exhaust_current_ma, r.MODE_EXHAUST: cycle.charge_current_ma}.get(int(cycle.mode), 0.0)
         assert closed < 80.0  # below any opening current
-    model = controller.model
+    model = controller.model[0]
     assert np.all(cycle.theta >= model.theta_min)
     assert np.all(cycle.theta <= model.theta_max)
 

@@ -1,3 +1,4 @@
+import re
 import subprocess
 import sys
 import tomllib
@@ -122,6 +123,16 @@ def test_run_dir_and_bench_dir_are_filled_in_everywhere(tmp_path):
     assert bench.plant.serial == f"pty://{tmp_path}/run/inclinometer"  # a default value
     assert bench.controller.trajectory == f"{folder}/my.csv"
     assert load_bench(file).inclinometer.port == "{run_dir}/inclinometer"
+
+
+def test_every_process_of_a_run_has_the_same_port_and_other_runs_another(tmp_path):
+    def ports(run):
+        bench = load_bench(shipped_benches()["sim"], tmp_path / run)
+        return {bench.plant.serial.removeprefix("listen"), bench.inclinometer.port.removeprefix("socket")}
+
+    assert ports("a") == ports("a") != ports("b")
+    assert len(ports("a")) == 1
+    assert re.fullmatch(r"://127\.0\.0\.1:[23]\d{4}", ports("a").pop())
 
 
 def test_what_is_kept_with_a_run_is_the_same_bench(tmp_path):

@@ -15,6 +15,7 @@ from softloop.deploy.live import PlainView
 from softloop.deploy.router import launcher_wire
 from softloop.deploy.run_dir import bench_lock, keep_bench
 from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, Unavailable
+from softloop.wire.session import open_router, open_wire
 from softloop.wire.shell import Stop
 
 TOY = (sys.executable, str(Path(__file__).with_name("toy_node.py")))
@@ -136,3 +137,18 @@ def test_two_launchers_of_one_bench_are_refused():
         pass
     with bench_lock(name):
         pass
+
+
+def test_a_shared_meeting_point_must_be_there_and_know_nobody_of_the_bench(short_dir):
+    file = short_dir / "toy.toml"
+    file.write_text(BENCH + "[run]\nshared_router = true\n")
+    bench = load_bench(file, short_dir)
+    with pytest.raises(Unavailable, match="no router at "), launcher_wire(bench):
+        pass
+    with open_router(bench.zenoh, bench.name):
+        with open_wire(bench.zenoh, bench.name, "plant") as plant:
+            plant.declare_alive()
+            with pytest.raises(Unavailable, match=r"bench 'toy' is running already at .*m\.sock: plant"), launcher_wire(bench):
+                pass
+        with launcher_wire(bench) as wire:
+            assert wire.processes_alive() == {"launcher"}

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from softloop.devices.protocols import can_frames as cf
 from softloop.devices.protocols.can_frames import Verdict
+from softloop.wire.messages import names_of
 
 U16, NIBBLE, COUNTER = st.integers(0, 65535), st.integers(0, 15), st.integers(0, 14)
 EIGHT = st.binary(min_size=8, max_size=8)
@@ -120,8 +121,6 @@ def test_counters_go_round_without_fifteen(counter):
 
 
 def test_the_dbc_agrees_with_the_messages():
-    from softloop.wire.messages import names_of
-
     database = cantools.database.load_file(cf.DBC_FILE)
     outputs = database.get_message_by_name("VALVE_COMMAND").get_signal_by_name("OUTPUT").choices
     assert {v: str(n).lower() for v, n in outputs.items()} == names_of("ValveStatus", "OUTPUT_")

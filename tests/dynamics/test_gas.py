@@ -11,7 +11,7 @@ RATIOS = st.floats(0.0, 1.0)
 def test_the_corrected_constants_meet_at_the_critical_ratio_with_equal_slope():
     assert pytest.approx(0.0404184, abs=1e-7) == gas.C1
     assert pytest.approx(0.1561738, abs=1e-7) == gas.C2
-    assert gas.CRITICAL_RATIO == pytest.approx(0.5282818, abs=1e-7)
+    assert pytest.approx(0.5282818, abs=1e-7) == gas.CRITICAL_RATIO
     above = gas.flow_function(gas.CRITICAL_RATIO + 1e-9)
     assert above == pytest.approx(gas.C1, rel=1e-12)
     slope = (gas.flow_function(gas.CRITICAL_RATIO + 1e-5) - gas.C1) / 1e-5

@@ -2,7 +2,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softloop.dynamics.parameters import KV1_CHARGE, KV1_EXHAUST, KV6_CHARGE, KV6_EXHAUST, LEAK, load_parameters, model_record, shipped
+from softloop.dynamics.parameters import (
+    KV1_CHARGE,
+    KV1_EXHAUST,
+    KV6_CHARGE,
+    KV6_EXHAUST,
+    LEAK,
+    load_parameters,
+    model_record,
+    shipped,
+)
 from softloop.dynamics.pneumatics import known_terms, pressure_rate
 from softloop.dynamics.valve import current_for_area, g3, g4, orifice_area
 

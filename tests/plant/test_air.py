@@ -48,7 +48,7 @@ def test_flux_is_that_of_the_dynamics(first, second):
 def test_a_choked_valve_passes_what_the_corrected_constant_says():
     into, _ = valve_flows(IDEAL, 200.0, 20.0, 1e-7, 0.0)
     assert into == pytest.approx(0.8 * 1e-7 * (200e3 + ATMOSPHERE_PA) / np.sqrt(293.15) * C1, rel=1e-12)
-    assert C1 == pytest.approx(0.04041842, rel=1e-6)
+    assert pytest.approx(0.04041842, rel=1e-6) == C1
 
 
 def test_shut_and_even_nothing_happens():

@@ -48,7 +48,7 @@ def test_one_way_needs_no_steps_between(start, end):
 @given(st.lists(ANGLE, min_size=2, max_size=12))
 def test_a_closed_path_only_takes_energy(corners):
     """The second turn begins and ends in the same memory, so that nothing is stored."""
-    path = np.concatenate([np.linspace(a, b, 200) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)])
+    path = np.concatenate([np.linspace(a, b, 60) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)])
     memory = relaxed(path[0])
     walk(memory, path)
     before = memory.stop.copy()

@@ -10,7 +10,8 @@ def sealed(layer, kpa, **plant):
     """A rig shut at a pressure, without leaks."""
     rig = Rig(layer=layer, **plant)
     rig.params.air.leak_m2 = rig.params.air.leak_laminar_kg_s_pa = 0.0
-    rig.state.command_charge_ma = rig.state.command_exhaust_ma = 0.0
+    state = rig.state
+    state.command_exhaust_ma = state.coil_exhaust_ma = state.play_exhaust_ma = 0.0
     settle_inputs(rig.params, rig.state)
     rig.state.x[CHAMBER] = kpa
     if layer == "rig":

@@ -27,8 +27,10 @@ def test_a_spool_comes_to_rest_where_equation_16_says():
     rig.hold(90.0, 95.0, 0, 200 * MS)
     x, air = rig.state.x, rig.params.air
     supply_pa, block_pa = 1e3 * x[SUPPLY], 1e3 * x[TUBE]
-    assert x[AREA_IN] == pytest.approx(orifice_area(air.charge, air.k_v1_charge, air.k_v6_charge, 90.0, supply_pa, block_pa), rel=1e-3)
-    assert x[AREA_OUT] == pytest.approx(orifice_area(air.exhaust, air.k_v1_exhaust, air.k_v6_exhaust, 95.0, block_pa, 0.0), rel=1e-3)
+    area_in = orifice_area(air.charge, air.k_v1_charge, air.k_v6_charge, 90.0, supply_pa, block_pa)
+    area_out = orifice_area(air.exhaust, air.k_v1_exhaust, air.k_v6_exhaust, 95.0, block_pa, 0.0)
+    assert x[AREA_IN] == pytest.approx(area_in, rel=1e-3)
+    assert x[AREA_OUT] == pytest.approx(area_out, rel=1e-3)
     assert x[AREA_IN] > 1e-8
     assert x[AREA_OUT] > 1e-8
 
@@ -39,9 +41,8 @@ def test_spools_stay_in_their_stroke_and_stop_at_its_ends(currents, seed):
     end = rig.params.air.charge.area_max_m2
     for n, (charge, exhaust) in enumerate(currents):
         rig.command(charge, exhaust, n * 5 * MS + 270_000)
-        for at in range(5):
+        for _ in range(5):
             advance(rig.params, rig.state, rig.state.t_ns + MS)
-            del at
             for place, speed in ((AREA_IN, SPEED_IN), (AREA_OUT, SPEED_OUT)):
                 assert 0.0 <= rig.state.x[place] <= end
                 if rig.state.x[place] == 0.0:

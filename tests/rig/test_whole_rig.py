@@ -51,7 +51,9 @@ def test_a_run_tracks_logs_everything_and_leaves_nothing_behind(short_bench, law
         assert rig.summary()
         assert (rig.run_dir / "report.html").stat().st_size > 50_000
         with (rig.run_dir / "run.mcap").open("rb") as stream:
-            decoded = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages(["/softloop/whole-" + law + "/cycle"])
+            decoded = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages(
+                ["/softloop/whole-" + law + "/cycle"]
+            )
             assert len({m.decoded_message.tick for m in decoded}) == len(log["cycle"])
 
 
@@ -113,7 +115,9 @@ def test_a_stopped_recorder_does_not_hold_the_loop(short_bench):
         cycles = open_log(rig.run_dir / "run.mcap")["cycle"]
         # All ticks of the stall ran: their numbers go on without a leap, though their records may be missing in the log.
         assert cycles["skipped_total"][-1] <= 20
-        assert cycles["tick"][-1] - cycles["tick"][0] == pytest.approx((cycles["stamp_ns"][-1] - cycles["stamp_ns"][0]) / 5e6, abs=1)
+        assert cycles["tick"][-1] - cycles["tick"][0] == pytest.approx(
+            (cycles["stamp_ns"][-1] - cycles["stamp_ns"][0]) / 5e6, abs=1
+        )
 
 
 def free_port():
@@ -155,7 +159,10 @@ def test_an_address_in_use_is_one_line(short_bench):
 
 
 def test_a_can_channel_nobody_answers_on_is_said_and_nothing_arms(short_bench):
-    text = short_bench + '[run]\narm_timeout_s = 3.0\nready_timeout_s = 15.0\n[plant]\ncan_valves = "elsewhere"\n[can.elsewhere]\ninterface = "zenoh"\nchannel = "other"\n'
+    text = (
+        short_bench
+        + '[run]\narm_timeout_s = 3.0\nready_timeout_s = 15.0\n[plant]\ncan_valves = "elsewhere"\n[can.elsewhere]\ninterface = "zenoh"\nchannel = "other"\n'
+    )
     with running(text, name="nobody") as rig:
         assert rig.finish() != 0
         assert "driver" in rig.output

@@ -46,7 +46,8 @@ class Bench:
     def __init__(self, run_dir, **config):
         self.run_dir = run_dir
         self.socket_dir = tempfile.TemporaryDirectory(prefix="sl", dir="/tmp")
-        self.zenoh = ZenohConfig(mode="client", endpoint=f"unixsock-stream/{self.socket_dir.name}/m.sock")
+        # On a busy machine a link must not be given up for a pause of half a second.
+        self.zenoh = ZenohConfig(mode="client", lease_ms=10_000, endpoint=f"unixsock-stream/{self.socket_dir.name}/m.sock")
         self.config = RecorderConfig(poll_s=0.005, flush_s=0.05, **config)
 
     def __enter__(self):
@@ -282,7 +283,7 @@ def test_a_killed_recorder_leaves_what_was_flushed(tmp_path: Path):
             "from softloop.watch.config import RecorderConfig; from softloop.watch.recorder import run\n"
             "from softloop.wire.config import ZenohConfig; from softloop.wire.session import open_wire\n"
             "from softloop.wire.shell import Context\n"
-            "with open_wire(ZenohConfig(mode='client', endpoint=sys.argv[1]), 'rec', 'other') as wire:\n"
+            "with open_wire(ZenohConfig(mode='client', lease_ms=10000, endpoint=sys.argv[1]), 'rec', 'other') as wire:\n"
             "    run(RecorderConfig(flush_s=0.05, poll_s=0.005), Context('other', 'rec', Path(sys.argv[2]), wire))\n"
         )
         child = subprocess.Popen([sys.executable, "-c", code, bench.zenoh.endpoint, str(other)])

@@ -36,6 +36,7 @@ def test_an_unknown_key_is_named_with_what_is_allowed():
 
 def test_wrong_type_range_and_missing_key_are_named():
     assert "key 'inner.depth'" in fault({"name": "x", "inner": {"depth": "deep"}})
+    assert "valid integer (got '7')" in fault({"name": "x", "inner": {"depth": "7"}})
     assert "less than or equal to 9 (got 10)" in fault({"name": "x", "inner": {"depth": 10}})
     assert "key 'name' is missing" in fault({})
     assert "key 'inner'" in fault({"name": "x", "inner": 3})
@@ -76,5 +77,3 @@ def test_any_content_gives_a_model_or_one_line(content):
         load_model(Outer, content, "b.toml")
     except BadConfig as error:
         assert str(error).startswith("b.toml: ")
-
-

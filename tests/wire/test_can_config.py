@@ -112,7 +112,10 @@ def test_table_defaults_and_faults():
     assert CanConfig().bitrate == 500_000
     assert CanConfig(interface="kvaser", channel=0).channel == 0
     for table, word in (
-        ({"chanel": "can0"}, "unknown key 'chanel'; allowed here: bitrate, channel, interface, mirror, options, send_timeout_ms"),
+        (
+            {"chanel": "can0"},
+            "unknown key 'chanel'; allowed here: bitrate, channel, interface, mirror, open_wait_s, options, send_timeout_ms",
+        ),
         ({"bitrate": 1}, "bitrate"),
         ({"options": {"channel": "x", "bitrate": 1}}, "bitrate, channel cannot stand in options"),
     ):
@@ -363,6 +366,17 @@ def test_slcan_port_over_a_pty_with_noise_on_the_line(ports, folder):
         wait_for(lambda: port.bus.serialPortOrig.in_waiting == 16)
         assert [port.recv(0).arbitration_id for _ in range(2)] == [0x100, 0x101]
         assert port.recv(0) is None
+
+
+def test_a_device_file_that_comes_later_is_waited_for(ports, folder):
+    lines = []
+    later = threading.Timer(0.3, lambda: lines.append(open_serial(f"pty://{folder}/can1", 115200, 0.1)))
+    later.start()
+    port = ports(channel=f"{folder}/can1", open_wait_s=20.0, **SLCAN)
+    later.join()
+    with lines[0]:
+        lines[0].write(b"t1232AABB\r")
+        assert recv(port).arbitration_id == 0x123
 
 
 def test_slcan_peer_killed_is_a_loss(ports, folder):

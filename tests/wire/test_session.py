@@ -4,12 +4,13 @@ import threading
 import time
 
 import pytest
+import zenoh
 
 from softloop.wire.channels import CHANNELS, COMMAND, EVENT, PRESSURE, channel_of_key, key
 from softloop.wire.config import ZenohConfig
 from softloop.wire.errors import Unavailable
 from softloop.wire.messages import message
-from softloop.wire.session import Wire, make_config, open_meeting, open_router, open_session
+from softloop.wire.session import Wire, make_config, open_meeting, open_router, open_session, open_wire
 from tests.wire.rendezvous import meeting, short_folder, two_wires
 
 PATIENCE_S = 10.0
@@ -45,7 +46,9 @@ def test_a_control_input_holds_the_newest_sample_and_nothing_older(mode):
         for seq in range(2, 50):
             put(sample(seq))
         seen = []
-        until(lambda: (p := latest.take()) and seen.append(message("PressureSample").unpack(p).seq) or (seen and seen[-1] == 49))
+        until(
+            lambda: ((p := latest.take()) and seen.append(message("PressureSample").unpack(p).seq)) or (seen and seen[-1] == 49)
+        )
         assert seen == sorted(seen)
         assert latest.take() is None
 
@@ -68,20 +71,16 @@ def test_an_inbox_keeps_order_wakes_and_counts_what_it_dropped():
 
 
 def test_processes_are_seen_alive_and_gone():
-    with meeting() as config:
-        from softloop.wire.session import open_wire
-
-        with open_wire(config, "test", "watcher") as watcher:
-            with open_wire(config, "test", "valves") as valves:
-                valves.declare_alive()
-                until(lambda: watcher.processes_alive() == {"valves"})
-            until(lambda: watcher.processes_alive() == set())
+    with meeting() as config, open_wire(config, "test", "watcher") as watcher:
+        with open_wire(config, "test", "valves") as valves:
+            valves.declare_alive()
+            until(lambda: watcher.processes_alive() == {"valves"})
+        until(lambda: watcher.processes_alive() == set())
 
 
 def test_an_address_in_use_and_a_missing_folder_are_one_line():
-    with meeting() as config:
-        with pytest.raises(Unavailable, match="in use"):
-            open_router(config, "test")
+    with meeting() as config, pytest.raises(Unavailable, match="in use"):
+        open_router(config, "test")
     with pytest.raises(Unavailable, match="no folder"):
         open_router(ZenohConfig(endpoint="unixsock-stream//nowhere/at/all.sock"), "test")
     with pytest.raises(Unavailable, match="at most 70 characters"):
@@ -116,9 +115,9 @@ def test_a_stalled_reader_does_not_hold_a_publisher():
     """A callback that never returns stalls its whole link; putting must still cost next to nothing."""
     release = threading.Event()
     with two_wires() as (a, b):
-        import zenoh
-
-        stalled = b.session.declare_subscriber(key("test", COMMAND), zenoh.handlers.Callback(lambda _: release.wait(30), indirect=False))
+        stalled = b.session.declare_subscriber(
+            key("test", COMMAND), zenoh.handlers.Callback(lambda _: release.wait(30), indirect=False)
+        )
         put = a.publisher(COMMAND)
         payload = bytes(60_000)
         longest = 0.0
