@@ -157,7 +157,8 @@ def record_inputs(inputs: Any, state: Any, cycle: Any) -> None:
 def record_thoughts(config: Any, measurement: Any, reference: Any, demand: Any, state: Any, valid: bool, cycle: Any) -> None:
     """What this tick made of it, into the cycle record."""
     on_plan = state.phase == PHASE_TRACK or state.phase == PHASE_DONE
-    cycle.trajectory_ns = cycle.stamp_ns - state.phase_start_ns - (0 if on_plan else config.approach_ns)
+    since_ns = cycle.stamp_ns - state.phase_start_ns if state.phase != PHASE_WAIT else 0
+    cycle.trajectory_ns = since_ns - (0 if on_plan else config.approach_ns)
     cycle.reference_deg, cycle.reference_rate_deg_s = reference.value, reference.rate
     cycle.reference_acceleration_deg_s2, cycle.reference_jerk_deg_s3 = reference.acceleration, reference.jerk
     if config.law == LAW_PRESSURE:  # its trajectory is a pressure and stands in desired_pressure_kpa

@@ -67,6 +67,7 @@ NEXT = np.array(
 )
 """New state by state (row) and event (column): the table above."""
 
+LATE_COMMANDS = 40  # a command so many numbers behind the last one came late by another way; farther behind, another counts
 REQUESTERS = 8  # whose last arm request is remembered; of more, the one heard first is forgotten
 
 GATE_CONFIG = record_dtype([
@@ -191,7 +192,9 @@ def command_reason(config: Any, state: Any, given: Any) -> int:
 
 @kernel(types.void(_CONFIG, _STATE, _INPUT))
 def take_command(config: Any, state: Any, given: Any) -> None:
-    """Judge a new command and keep what later steps need of it."""
+    """Judge a new command and keep what later steps need of it; one that others have overtaken says nothing any more."""
+    if 0 <= state.command_seq - given.command_seq < LATE_COMMANDS and state.command_received_ns > 0:
+        return
     state.command_reason = command_reason(config, state, given)
     state.command_seq = given.command_seq
     state.command_received_ns = given.command_received_ns

@@ -61,7 +61,7 @@ class ValvesLoop:
         self.state, self.given, self.output = (new_record(d) for d in (g.GATE_STATE, g.GATE_INPUT, g.GATE_OUTPUT))
         self.driver = can_frames.E2eReceiver(can_frames.VALVE_STATUS_ID, config.valves.driver_max_lost)
         self.driver_frame = can_frames.ValveStatusFrame(0, 0, 0, 0, 0)
-        self.seq = self.tick = self.bus_offs = 0
+        self.seq = self.tick = self.bus_offs = self.late_ns = 0
         self.said_driver, self.said_refusal, self.was_off = g.DRIVER_SILENT, 0, False
         self.lost: Lost | None = None
         self._warm()
@@ -107,14 +107,13 @@ class ValvesLoop:
         given.charge_current_ma, given.exhaust_current_ma = command.charge_current_ma, command.exhaust_current_ma
         given.ready, self.tick = command.ready, command.tick
         self.deadline_ns = now_ns + self.wait_ns
-        self.status.cycle()
+        self.late_ns = 0
         return True
 
     def _be_silent(self, now_ns: int) -> None:
-        late_ns = now_ns - self.deadline_ns
+        self.late_ns = late_ns = now_ns - self.deadline_ns
         self.tick += 1
         self.deadline_ns = self.deadline_ns + PERIOD_NS if late_ns < PERIOD_NS else now_ns + PERIOD_NS
-        self.status.cycle(late_ns=late_ns, skipped=late_ns // PERIOD_NS)
 
     def read(self) -> None:
         """Requests, and what the driver and the bus say."""
@@ -170,16 +169,17 @@ class ValvesLoop:
                 self.lost = error
         self._publish(stamp_ns)
         self._say(stamp_ns)
+        self.status.cycle(late_ns=self.late_ns, skipped=self.late_ns // PERIOD_NS)
         if self.lost is not None:
             raise self.lost
 
     def _publish(self, stamp_ns: int) -> None:
         given, output, driver = self.given, self.output, self.driver_frame
-        new = int(given.command_new)
+        answered = given.command_new != 0 and given.command_seq == self.state.command_seq  # not one that was overtaken
         status = _STATUS.make(
             seq=self.seq,
             stamp_ns=stamp_ns,
-            command_seq=int(given.command_seq) * new,
+            command_seq=int(given.command_seq) if answered else 0,
             tick=self.tick,
             command_received_ns=int(given.command_received_ns),
             driver_stamp_ns=int(given.driver_stamp_ns),

@@ -25,6 +25,7 @@ Ints = NDArray[np.int64]
 
 PHASE_TRACK = constant("CycleRecord", "PHASE_TRACK")
 PHASE_DONE = constant("CycleRecord", "PHASE_DONE")
+GATE_ARMED = constant("ValveStatus", "GATE_ARMED")
 STEADY_S = 2.0  # the end of a dwell over which the steady error is taken
 STILL_DEG_S = 1e-9  # a reference slower than this dwells; polynomials of a dwell give exactly zero
 PERCENTILES = (50.0, 99.0, 99.9)
@@ -55,6 +56,18 @@ class Errors:
             "rms_deg": float(np.sqrt(np.mean(e * e))),
             "steady_deg": float(e[self.steady].max()) if self.steady.any() else None,
         }
+
+
+def while_armed(log: Log, records: Records) -> Records:
+    """Those of `records` whose stamp falls where the gate's last word was ARMED; all of them where no gate spoke.
+
+    What happens before and after, while processes start and end, is no part of a run's evidence.
+    """
+    valves = log["valves"]
+    if not len(valves):
+        return records
+    before = np.searchsorted(valves["stamp_ns"], records["stamp_ns"], side="right") - 1
+    return records[(before >= 0) & (valves["gate"][np.maximum(before, 0)] == GATE_ARMED)]
 
 
 def tracked(log: Log) -> Records:
@@ -145,8 +158,8 @@ def spread(values: Floats, percentiles: tuple[float, ...] = PERCENTILES) -> dict
 
 
 def lateness_us(log: Log) -> Floats:
-    """How late each tick woke, in us, (n,): all phases."""
-    cycles = log["cycle"]
+    """How late each tick woke, in us, (n,): all while the gate was armed."""
+    cycles = while_armed(log, log["cycle"])
     return (cycles["woken_ns"] - cycles["stamp_ns"]) * 1e-3
 
 

@@ -57,7 +57,7 @@ def _meanings() -> dict[str, str]:
         "pressure_error_max_kpa": "largest |chamber pressure less desired| in PHASE_TRACK (the plant's, else as measured)",
         "pressure_error_rms_kpa": "its root mean square",
         "ticks": "cycle records",
-        "ticks_skipped": "ticks that the controller left out",
+        "ticks_skipped": "ticks that the controller left out while the gate was armed",
         "inputs_invalid_ticks": "ticks of PHASE_TRACK on which an input was too old or not valid",
         "saturated_percent": "share of PHASE_TRACK with a command at a limit",
         "mode_switches_per_s": "changes of the working mode per second of PHASE_TRACK",
@@ -65,8 +65,8 @@ def _meanings() -> dict[str, str]:
         "messages": "messages in the log",
         "log_problems": "damaged or missing parts of the log file, separated by '; '",
         "recorder_dropped": "messages that the recorder dropped (backlog, storage, malformed); empty without recorder.json",
-        "plant_late_max_ms": "the plant's worst lateness behind the clock; empty without a plant",
-        "plant_deadline_misses": "deadlines that the plant missed",
+        "plant_late_max_ms": "the plant's worst lateness behind the clock while the gate was armed; empty without a plant",
+        "plant_deadline_misses": "times at which it was late by more than 2 ms, while the gate was armed",
         "gate_faults": "transitions of the gate to FAULT",
         "gate_fault_reasons": "their reasons, separated by '; '",
         "driver_watchdog_trips": "times at which the valve driver vented by itself",
@@ -133,7 +133,7 @@ def _course(log: Log) -> dict[str, Value]:
         "track_s": _seconds(track),
         "dwells": len(dwells(track)),
         "ticks": len(cycles),
-        "ticks_skipped": int(cycles["skipped"].sum()),
+        "ticks_skipped": int(metrics.while_armed(log, cycles)["skipped"].sum()),
         "inputs_invalid_ticks": int(np.count_nonzero(track["inputs_valid"] == 0)),
         "saturated_percent": float(np.mean(track["saturated"] != 0)) * 100.0 if len(track) else None,
         "mode_switches_per_s": metrics.switches_per_s(track, [(0, len(track))] if len(track) else []),
@@ -180,13 +180,11 @@ def _losses(log: Log) -> dict[str, Value]:
 
 
 def _plant(log: Log) -> dict[str, Value]:
-    truth = log["truth"]
+    truth = metrics.while_armed(log, log["truth"])
     if not len(truth):
         return {"plant_late_max_ms": None, "plant_deadline_misses": None}
-    return {
-        "plant_late_max_ms": float(truth["late_max_ns"].max()) * 1e-6,
-        "plant_deadline_misses": int(truth["deadline_misses"].max()),
-    }
+    misses = truth["deadline_misses"]
+    return {"plant_late_max_ms": float(truth["late_max_ns"].max()) * 1e-6, "plant_deadline_misses": int(misses[-1] - misses[0])}
 
 
 def _gate(log: Log) -> dict[str, Value]:

@@ -98,6 +98,7 @@ class Plant:
     def _publish_truth(self) -> None:
         truth = self._state.truth
         truth.deadline_misses, truth.late_max_ns = self._misses, self._late_max_ns
+        self._late_max_ns = 0
         self._put_truth(self._truth_type.pack_record(truth))
 
     def _send_due(self, now_ns: int) -> int:

@@ -21,7 +21,7 @@ class GateBench:
         self.config = g.gate_config(self.process)
         self.state, self.given, self.output = (new_record(d) for d in (g.GATE_STATE, g.GATE_INPUT, g.GATE_OUTPUT))
         self.now_ns = START_NS
-        self.seq = self.arms = 0
+        self.seq, self.arms = 1000, 0
 
     def tick(self, *, command=True, heard=True, after_ns=PERIOD_NS, **fields):
         """One step; `fields` replace what the inputs would be. Returns the output record."""

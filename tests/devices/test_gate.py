@@ -81,6 +81,14 @@ def test_no_arming_while_a_fault_condition_holds(reason, fields, first):
     assert bench.arm().gate == g.GATE_ARMED
 
 
+def test_a_command_that_was_overtaken_is_no_command():
+    bench = GateBench().armed()
+    for _ in range(3):
+        output = bench.tick(command_seq=bench.seq - 5, charge_current_ma=NAN)
+        assert (output.gate, output.charge_counts) == (g.GATE_ARMED, 10_000)
+    assert bench.tick(command_seq=bench.seq - 5).reason == g.REASON_COMMAND_SILENT
+
+
 def test_the_limits_themselves_are_allowed():
     bench = GateBench().armed()
     edge = {"chamber_pressure_kpa": 190.0, "angle_deg": 200.0, "charge_current_ma": 220.0, "exhaust_current_ma": 0.0}
