@@ -233,6 +233,4 @@ def controller_tick_of_arrays(
     state: np.ndarray, scratch: np.ndarray, first: np.ndarray, cycle: np.ndarray,
 ) -> None:  # fmt: skip
     """`controller_tick` on arrays of one record each: from Python a call with arrays costs a third of one with records."""
-    controller_tick(
-        config[0], model[0], gains[0], knots, table, inputs[0], state[0], scratch[0], first[0], cycle[0]
-    )
+    controller_tick(config[0], model[0], gains[0], knots, table, inputs[0], state[0], scratch[0], first[0], cycle[0])

@@ -29,6 +29,8 @@ GATE_ARMED = constant("ValveStatus", "GATE_ARMED")
 STEADY_S = 2.0  # the end of a dwell over which the steady error is taken
 STILL_DEG_S = 1e-9  # a reference slower than this dwells; polynomials of a dwell give exactly zero
 PERCENTILES = (50.0, 99.0, 99.9)
+STEADY = tuple(c for c in CHANNELS if c.logged and c.rate_hz >= 100.0 and c.message != "CanFrame")
+SILENT_S = 2.0  # processes end one after the other, but within this
 
 
 @dataclass(frozen=True)
@@ -258,6 +260,17 @@ def losses(log: Log) -> dict[str, tuple[int, int, int]]:
     of_buses = [_losses(np.concatenate(frames), "CanFrame") for frames in buses.values()]
     found["can"] = (sum(x[0] for x in of_buses), sum(x[1] for x in of_buses), sum(x[2] for x in of_buses))
     return found
+
+
+def fallen_silent(log: Log) -> dict[str, float]:
+    """Steady channels that end early: name -> seconds between their last message and the last of any of them.
+
+    A break in the sequence numbers shows only where a later message comes; this shows where none does.
+    """
+    last = {c.name: int(log[c.name]["stamp_ns"][-1]) for c in STEADY if len(log[c.name])}
+    end = max(last.values(), default=0)
+    silent = {name: (end - stamp) * 1e-9 for name, stamp in last.items()}
+    return {name: seconds for name, seconds in silent.items() if seconds > SILENT_S}
 
 
 def _losses(records: Records, kind: str) -> tuple[int, int, int]:

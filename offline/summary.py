@@ -64,6 +64,7 @@ def _meanings() -> dict[str, str]:
         "mode_switches_dwell_per_s": "the same within dwells only",
         "messages": "messages in the log",
         "log_problems": "damaged or missing parts of the log file, separated by '; '",
+        "silent_channels": "channels whose messages end long before the others', separated by '; '",
         "recorder_dropped": "messages that the recorder dropped (backlog, storage, malformed); empty without recorder.json",
         "plant_late_max_ms": "the plant's worst lateness behind the clock while the gate was armed; empty without a plant",
         "plant_deadline_misses": "times at which it was late by more than 2 ms, while the gate was armed",
@@ -112,6 +113,7 @@ def evidence_problems(found: dict[str, Any]) -> list[str]:
         (found["missing_cycle"] > 0, f"{found['missing_cycle']} cycle records are missing"),
         (found["missing_truth"] > 0, f"{found['missing_truth']} truth records are missing"),
         (bool(found["log_problems"]), "the log file is damaged or unfinished"),
+        (bool(found["silent_channels"]), f"messages end early: {found['silent_channels']}"),
     )
     return [text for bad, text in checks if bad]
 
@@ -171,6 +173,8 @@ def _latency(log: Log) -> dict[str, Value]:
 
 def _losses(log: Log) -> dict[str, Value]:
     found: dict[str, Value] = {"messages": 0, "log_problems": "; ".join(log.problems)}
+    silent = metrics.fallen_silent(log).items()
+    found["silent_channels"] = "; ".join(f"{name} {seconds:.1f} s before the end" for name, seconds in silent)
     total = 0
     for name, (messages, missing, repeated) in metrics.losses(log).items():
         found |= {f"messages_{name}": messages, f"missing_{name}": missing, f"repeated_{name}": repeated}

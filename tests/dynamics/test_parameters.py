@@ -48,7 +48,7 @@ def test_impossible_bounds_name_file_and_key(tmp_path):
 
 
 def test_unknown_keys_and_missing_files_are_named(tmp_path):
-    with pytest.raises(BadConfig, match="unknown key 'bending.a9'; allowed here: a0, a1, a2, b0"):
+    with pytest.raises(BadConfig, match=r"unknown key 'bending\.a9'; allowed here: a0, a1, a2, b0"):
         load_parameters(changed(tmp_path, "bending", "a9", 1.0))
     with pytest.raises(BadFile, match="cannot be read"):
         load_parameters(tmp_path / "none.toml")

@@ -69,6 +69,14 @@ def test_a_plant_that_was_two_milliseconds_late_is(tmp_path):
     assert write_summary(run_dir(tmp_path, made))["evidence_valid"] is True
 
 
+def test_a_channel_that_falls_silent_is_no_evidence_though_no_number_is_missing(tmp_path):
+    made = [m for m in synthetic.messages(4.0) if not (m[0] == "valves" and m[2].seq > 200)]
+    found = write_summary(run_dir(tmp_path, made))
+    assert found["missing_valves"] == 0
+    assert found["silent_channels"].startswith("valves 3.")
+    assert found["evidence_valid"] is False
+
+
 def test_a_missing_cycle_record_could_hide_the_largest_error(tmp_path):
     made = [m for m in synthetic.messages(1.0) if not (m[0] == "cycle" and m[2].seq == 77)]
     found = write_summary(run_dir(tmp_path, made))

@@ -159,10 +159,8 @@ def test_an_address_in_use_is_one_line(short_bench):
 
 
 def test_a_can_channel_nobody_answers_on_is_said_and_nothing_arms(short_bench):
-    text = (
-        short_bench
-        + '[run]\narm_timeout_s = 3.0\nready_timeout_s = 15.0\n[plant]\ncan_valves = "elsewhere"\n[can.elsewhere]\ninterface = "zenoh"\nchannel = "other"\n'
-    )
+    text = short_bench + '[run]\narm_timeout_s = 3.0\n[plant]\ncan_valves = "elsewhere"\n'
+    text += '[can.elsewhere]\ninterface = "zenoh"\nchannel = "other"\n'
     with running(text, name="nobody") as rig:
         assert rig.finish() != 0
         assert "driver" in rig.output

@@ -16,7 +16,7 @@ class Inner(Table):
 class Outer(Table):
     name: str
     inner: Inner = Inner()
-    many: dict[str, Inner] = {}
+    many: dict[str, Inner] = Field(default_factory=dict)
 
 
 def fault(content):
@@ -57,11 +57,13 @@ def test_files_that_are_missing_or_not_toml_are_one_line(tmp_path):
 def test_any_bytes_give_a_model_or_one_line(tmp_path_factory, data):
     file = tmp_path_factory.getbasetemp() / "fuzz.toml"
     file.write_bytes(data)
+    complaint = str(file)
     try:
         load_model(Outer, read_toml(file), file)
     except (BadFile, BadConfig) as error:
-        assert str(file) in str(error)
-        assert "Traceback" not in str(error)
+        complaint = str(error)
+    assert str(file) in complaint
+    assert "\n" not in complaint
 
 
 JSONISH = st.recursive(
@@ -73,7 +75,9 @@ JSONISH = st.recursive(
 
 @given(st.dictionaries(st.sampled_from(["name", "inner", "many", "y"]), JSONISH))
 def test_any_content_gives_a_model_or_one_line(content):
+    complaint = "b.toml: "
     try:
         load_model(Outer, content, "b.toml")
     except BadConfig as error:
-        assert str(error).startswith("b.toml: ")
+        complaint = str(error)
+    assert complaint.startswith("b.toml: ")
