@@ -34,6 +34,8 @@ SOURCE = constant("Event", "SOURCE_RECORDER")
 KIND_BACKLOG = constant("Event", "KIND_BACKLOG")
 CODE_BACKLOG = 0  # Event.code with KIND_BACKLOG: the recorder did not keep up
 CODE_STORAGE = 1  # the disk took nothing
+CODE_RENEWED = 2  # a steady channel fell silent, and the recorder subscribed anew
+_STEADY_HZ = 100.0  # a channel of at least this rate that says nothing for a second is silent
 STATUS_S = 1.0
 _STORE_BYTES = 1 << 20
 _RETRY_S = 0.1
@@ -165,6 +167,8 @@ class Recorder:
         self._publish_status = context.wire.publisher(STATUS)
         self._events = self._statuses = self._passes = 0
         self._said_dropped = 0
+        self._heard: dict[str, int] = {}
+        self._silent: set[str] = set()
         self._refused = False
         self._late_max_ns = 0
         self.store()
@@ -222,6 +226,20 @@ class Recorder:
         self.account.storage_errors.append(text)
         say(NAME, f"{self.config.file}: {text}; the run goes on, and up to {self.config.unwritten_mib} MiB wait for the disk")
         self._event(CODE_STORAGE, self.account.storage)
+
+    def listen_again(self) -> None:
+        """Once a second: where a steady channel has fallen silent, subscribe anew, once per silence.
+
+        Seen once, at a start on a busy machine: a process whose way to the recorder changed from the router to a
+        direct link sent nothing more there, though its other readers heard it.
+        """
+        now = {key: count[0] for key, count in self.account.topics.items()}
+        steady = {key for key in now if (channel := self._channels.get(key)) and channel.rate_hz >= _STEADY_HZ}
+        silent = {key for key in steady if now[key] == self._heard.get(key)}
+        if silent - self._silent:
+            self.inbox.renew()
+            self._event(CODE_RENEWED, len(silent))
+        self._silent, self._heard = silent, now
 
     def report(self) -> None:
         """Once a second: drops as an event, and this process's status."""
@@ -301,6 +319,7 @@ def run(config: RecorderConfig, context: Context) -> None:
             next_flush_s = now_s + config.flush_s
         if now_s >= next_report_s:
             recorder.report()
+            recorder.listen_again()
             next_report_s = now_s + STATUS_S
         recorder.keep_time(now_s)
     recorder.finish()

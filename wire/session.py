@@ -31,6 +31,8 @@ def make_config(
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
+        # Of two peers that hear of each other, one connects: two links at once, one of which is given up again, are a race.
+        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
         "listen/endpoints": listen,
         "listen/exit_on_failure": listen_must_work,
         "listen/timeout_ms": 0,
@@ -128,9 +130,17 @@ class Inbox:
     def __init__(self, session: zenoh.Session, key_expr: str, capacity: int = 4096) -> None:
         self._items: deque[tuple[str, bytes]] = deque(maxlen=capacity)
         self._ready = threading.Condition()
+        self._session, self._key_expr = session, key_expr
         self.dropped = 0
-        handler = zenoh.handlers.Callback(self._receive, indirect=False)
-        self._subscriber = session.declare_subscriber(key_expr, handler)
+        self._subscriber = self._subscribe()
+
+    def _subscribe(self) -> Any:
+        return self._session.declare_subscriber(self._key_expr, zenoh.handlers.Callback(self._receive, indirect=False))
+
+    def renew(self) -> None:
+        """Subscribe anew, so that every neighbour hears of it again; what is sent meanwhile is lost."""
+        self._subscriber.undeclare()
+        self._subscriber = self._subscribe()
 
     def _receive(self, sample: zenoh.Sample) -> None:
         with self._ready:
