@@ -24,14 +24,14 @@ class ActuationConfig(Table):
 class PidConfig(Table):
     """`[controller.pid]`: C1; pressure in kPa from angle in deg."""
 
-    kp: float = Field(1.0, ge=0)
-    ki: float = Field(4.0, ge=0)
-    kd: float = Field(0.08, ge=0)
+    kp: float = Field(1.0, ge=0, description="proportional gain, kPa/deg")
+    ki: float = Field(4.0, ge=0, description="integral gain, kPa/(deg s)")
+    kd: float = Field(0.08, ge=0, description="derivative gain, kPa s/deg")
     kv: float = Field(0.24, ge=0, description="velocity feedforward; nominal c0 / b0")
     ka: float = Field(0.0155, ge=0, description="acceleration feedforward; nominal 1 / b0")
-    integral_max_kpa: float = Field(180.0, gt=0)
+    integral_max_kpa: float = Field(180.0, gt=0, description="bound of the integral's part, either way")
     pressure_gain: float = Field(20.0, gt=0, description="1/s, pressure error to flow")
-    desired_max_kpa: float = Field(150.0, gt=0)
+    desired_max_kpa: float = Field(150.0, gt=0, description="the law asks for no higher chamber pressure")
 
 
 class ArcConfig(Table):
@@ -48,21 +48,21 @@ class ArcConfig(Table):
     gamma: float = Field(5.0e-5, ge=0, description="adaptation gain of the mechanics, times theta_M^2")
     gamma_valve: float = Field(3.0e-6, ge=0, description="adaptation gain of valves and leak, times theta_M^2")
     rate_limit: float = Field(0.5, gt=0, description="an estimate moves at most this part of its range in 1 s")
-    desired_max_kpa: float = Field(150.0, gt=0)
+    desired_max_kpa: float = Field(150.0, gt=0, description="the law asks for no higher chamber pressure")
 
 
 class PressureConfig(Table):
     """`[controller.pressure]`: step 2 alone."""
 
-    k2: float = Field(30.0, gt=0)
-    epsilon2: float = Field(1.0e3, gt=0)
-    delta2: float = Field(60.0, ge=0)
+    k2: float = Field(30.0, gt=0, description="K_2, 1/s")
+    epsilon2: float = Field(1.0e3, gt=0, description="kPa^2/s, Eq. 47")
+    delta2: float = Field(60.0, ge=0, description="bound of Delta_2, kPa/s")
 
 
 class ControllerConfig(Table):
-    """`[controller]`."""
+    """`[controller]`: the law, its trajectory, and what it is told of delays and budgets."""
 
-    law: Literal["pid", "arc", "pressure"] = "arc"
+    law: Literal["pid", "arc", "pressure"] = Field("arc", description="C1, C3, or step 2 of C3 alone; each has its table below")
     parameters: str = Field("table1", description="a shipped parameter set, or the path of a parameter file")
     trajectory: str = Field("t1", description="t1, t2, excitation_1hz, excitation_05hz, or the path of a CSV file t_s, value")
     trajectory_seed: int = Field(1, ge=0, le=2**32 - 1, description="phases of the multi-sines")

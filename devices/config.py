@@ -57,9 +57,9 @@ class ValvesConfig(Table):
 class SensorConfig(Table):
     """One pressure sensor: gauge pressure = (volts - zero_v) / (full_v - zero_v) * span_kpa."""
 
-    zero_v: float = Field(0.0, ge=-10, le=10)
-    full_v: float = Field(10.0, ge=-10, le=10)
-    span_kpa: float = Field(250.0, gt=0, le=10_000)
+    zero_v: float = Field(0.0, ge=-10, le=10, description="the sensor's output at 0 kPa gauge")
+    full_v: float = Field(10.0, ge=-10, le=10, description="its output at span_kpa; above zero_v")
+    span_kpa: float = Field(250.0, gt=0, le=10_000, description="gauge pressure at full_v")
     margin_kpa: float = Field(5.0, ge=0, description="a reading further than this outside 0..span_kpa is out of range")
 
     @model_validator(mode="after")

@@ -17,8 +17,8 @@ from softloop.wire.errors import BadConfig
 class SensorConfig(Table):
     """A pressure sensor as its data sheet has it; the rig layer adds this specimen's errors."""
 
-    zero_v: float = 0.0
-    full_v: float = 10.0
+    zero_v: float = Field(0.0, description="output at 0 kPa gauge")
+    full_v: float = Field(10.0, description="output at span_kpa; above zero_v")
     span_kpa: float = Field(250.0, gt=0, description="gauge pressure at full_v less that at zero_v")
 
     @model_validator(mode="after")
@@ -31,8 +31,8 @@ class SensorConfig(Table):
 class LoadConfig(Table):
     """A payload or a contact that comes and goes. Times count from the plant's start, when its process enters its loop."""
 
-    kind: Literal["payload", "contact"]
-    on_s: float = Field(ge=0)
+    kind: Literal["payload", "contact"] = Field(description="a weight that is lifted, or a wall that is bent against")
+    on_s: float = Field(ge=0, description="when it comes")
     off_s: float = Field(1e9, gt=0, description="default: it stays")
     size: float = Field(gt=0, description="payload: deg/s2 at 90 deg; contact: stiffness in deg/s2 per deg")
     angle_deg: float = Field(90.0, description="contact: where the wall stands")
@@ -47,13 +47,13 @@ class LoadConfig(Table):
 class PlantConfig(Table):
     """`[plant]`: which rig is simulated, and on which wires."""
 
-    layer: Literal["ideal", "rig"] = "rig"
+    layer: Literal["ideal", "rig"] = Field("rig", description="ideal: the controller's own model; rig: also what that leaves out")
     seed: int = Field(1, ge=0, description="which specimen of a rig, and its noise")
     parameters: str = Field("table1", description="parameter file about which the rig is drawn: a path, or a shipped name")
     step_us: int = Field(500, ge=10, le=1000, description="longest integration step; pieces between events are shorter")
 
-    can_valves: str = "can0"
-    can_analog: str = "can0"
+    can_valves: str = Field("can0", description="which [can.NAME] the simulated valve driver is on")
+    can_analog: str = Field("can0", description="which [can.NAME] the simulated analogue module is on")
     serial: str = Field("pty://{run_dir}/inclinometer", description="where the inclinometer's bytes go, a pyserial URL")
     baud: int = Field(115_200, description="of the inclinometer as it leaves the shelf")
     rate_hz: int = Field(200, description="of the inclinometer as it leaves the shelf")
@@ -61,18 +61,18 @@ class PlantConfig(Table):
 
     supply_sensor: SensorConfig = SensorConfig()
     chamber_sensor: SensorConfig = SensorConfig()
-    pressure_noise_kpa: float = Field(0.1, ge=0)
+    pressure_noise_kpa: float = Field(0.1, ge=0, description="standard deviation of a pressure reading's noise")
     pressure_rise_ms: float = Field(3.0, ge=0, description="10 to 90 % of the sensors; none in the ideal layer")
-    angle_noise_deg: float = Field(0.05, ge=0)
-    rate_noise_deg_s: float = Field(0.1, ge=0)
-    coil_noise_ma: float = Field(0.05, ge=0)
+    angle_noise_deg: float = Field(0.05, ge=0, description="likewise of the inclinometer's angle")
+    rate_noise_deg_s: float = Field(0.1, ge=0, description="likewise of its rate")
+    coil_noise_ma: float = Field(0.05, ge=0, description="likewise of the coil currents that the driver measures")
 
     vent_current_ma: float = Field(200.0, ge=0, description="exhaust current of the driver's own vent")
-    watchdog_ms: float = Field(20.0, gt=0)
+    watchdog_ms: float = Field(20.0, gt=0, description="the driver vents by itself after this time without a good frame")
     command_delay_ms: float = Field(0.0, ge=0, le=1000, description="added to the wire to the driver, for latency studies")
     measurement_delay_ms: float = Field(0.0, ge=0, le=1000, description="added to the wires from the sensors and the driver")
 
-    loads: tuple[LoadConfig, ...] = Field((), max_length=16)
+    loads: tuple[LoadConfig, ...] = Field((), max_length=16, description="payloads and contacts, each a [[plant.loads]]")
 
     @model_validator(mode="after")
     def _known_device_settings(self) -> PlantConfig:

@@ -32,7 +32,7 @@ def default_endpoint(bench: str) -> str:
 class ZenohConfig(Table):
     """`[zenoh]`: how the processes of a bench find each other."""
 
-    mode: Literal["peer", "client"] = "peer"
+    mode: Literal["peer", "client"] = Field("peer", description="peer: direct links; client: all by way of the meeting point")
     endpoint: str = Field("", description="meeting point; empty: a Unix socket named after the bench")
     lease_ms: int = Field(500, ge=50, le=60_000, description="a silent link is given up after this")
 
@@ -51,4 +51,4 @@ class HostConfig(Table):
     """`[host]`: what the computer grants the processes of the 5 ms path."""
 
     realtime_priority: int = Field(50, ge=0, le=98, description="SCHED_FIFO priority; 0 asks for none")
-    lock_memory: bool = True
+    lock_memory: bool = Field(True, description="also lock memory; not asked for at priority 0")

@@ -31,8 +31,6 @@ def make_config(
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
-        # Of two peers that hear of each other, one connects: two links at once, one of which is given up again, are a race.
-        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
         "listen/endpoints": listen,
         "listen/exit_on_failure": listen_must_work,
         "listen/timeout_ms": 0,

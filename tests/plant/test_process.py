@@ -205,7 +205,7 @@ def test_a_stall_is_counted_and_frames_sent_meanwhile_take_effect_at_their_time(
         bench.hold(80.0, 0.3)
         truths = bench.taken(bench.truths, "PlantTruth")
     assert truths[-1].deadline_misses > misses
-    assert truths[-1].late_max_ns > 40_000_000
+    assert max(truth.late_max_ns for truth in truths) > 40_000_000
     assert [t.seq for t in truths] == list(range(truths[0].seq, truths[-1].seq + 1))
     # Every valve frame was applied in order; most exactly at their end, though the plant looked 50 ms later.
     exact = [t.command_applied_ns == t.command_end_ns for t in truths]
