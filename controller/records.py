@@ -23,6 +23,10 @@ MODES_TABLE_2, MODES_FLOW_DEMAND = 0, 1
 MODE_RULES = {"table2": MODES_TABLE_2, "flow": MODES_FLOW_DEMAND}
 
 CYCLE = message("CycleRecord").dtype
+# Places of `CycleRecord.internal`: the measurement that the law was given, then what the record would otherwise lack of the
+# state after the tick (`recall` reads it back).
+IN_CHAMBER_KPA, IN_SUPPLY_KPA, IN_PERIOD_S, IN_INTEGRAL_KPA, IN_MODE_TICKS = 0, 1, 2, 3, 4
+IN_APPROACH_START, IN_CHARGE_BEFORE_MA, IN_EXHAUST_BEFORE_MA = 5, 6, 7
 
 # What lay on the inputs when the tick began: the newest message of each channel, whole.
 INPUTS = record_dtype(

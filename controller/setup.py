@@ -71,9 +71,12 @@ def plan_of(config: ControllerConfig) -> Plan:
     return references.from_csv(path)
 
 
-def build(config: ControllerConfig) -> Controller:
-    """All records of a controller. Raises BadFile or BadConfig; BadConfig too when the trajectory is not feasible."""
-    model = model_record(parameters_of(config))
+def build(config: ControllerConfig, parameters: Parameters | None = None) -> Controller:
+    """All records of a controller, on `parameters` where they are given and not on the file that `config` names.
+
+    Raises BadFile or BadConfig; BadConfig too when the trajectory is not feasible.
+    """
+    model = model_record(parameters or parameters_of(config))
     plan = plan_of(config)
     (check_pressure_plan if config.law == "pressure" else check_angle_plan)(plan, model)
     state = np.zeros(1, CONTROLLER_STATE)

@@ -19,6 +19,14 @@ from softloop.controller.records import (
     DEMAND_TYPE,
     GAINS_TYPE,
     GATE_ARMED,
+    IN_APPROACH_START,
+    IN_CHAMBER_KPA,
+    IN_CHARGE_BEFORE_MA,
+    IN_EXHAUST_BEFORE_MA,
+    IN_INTEGRAL_KPA,
+    IN_MODE_TICKS,
+    IN_PERIOD_S,
+    IN_SUPPLY_KPA,
     INPUTS_TYPE,
     LAW_ARC,
     LAW_PID,
@@ -94,6 +102,8 @@ def follow_phase(config: Any, inputs: Any, knots: np.ndarray, table: np.ndarray,
     armed = inputs.valves.gate == GATE_ARMED
     if not armed and state.phase != PHASE_DONE:
         state.phase = PHASE_WAIT
+        for i in range(state.approach.size):  # an approach that was broken off must not go on in the log beyond its end
+            state.approach[i] = 0.0
     if state.phase == PHASE_WAIT and armed and inputs_valid(config, inputs):
         begin_approach(config, inputs, knots, table, state, scratch)
     if state.phase == PHASE_APPROACH and inputs.now_ns - state.phase_start_ns >= config.approach_ns:
@@ -171,11 +181,11 @@ def record_thoughts(config: Any, measurement: Any, reference: Any, demand: Any, 
     cycle.charge_current_ma, cycle.exhaust_current_ma = state.charge_ma, state.exhaust_ma
     for i in range(state.theta.size):
         cycle.theta[i] = state.theta[i]
-    cycle.internal[0] = measurement.chamber_kpa
-    cycle.internal[1] = measurement.supply_kpa
-    cycle.internal[2] = measurement.period_s
-    cycle.internal[3] = state.pid.integral_kpa
-    cycle.internal[4] = state.mode_ticks
+    cycle.internal[IN_CHAMBER_KPA], cycle.internal[IN_SUPPLY_KPA] = measurement.chamber_kpa, measurement.supply_kpa
+    cycle.internal[IN_PERIOD_S] = measurement.period_s
+    cycle.internal[IN_INTEGRAL_KPA], cycle.internal[IN_MODE_TICKS] = state.pid.integral_kpa, state.mode_ticks
+    cycle.internal[IN_APPROACH_START] = state.approach[0]
+    cycle.internal[IN_CHARGE_BEFORE_MA], cycle.internal[IN_EXHAUST_BEFORE_MA] = state.charge_before_ma, state.exhaust_before_ma
     cycle.phase, cycle.mode = state.phase, state.mode
     cycle.inputs_valid, cycle.saturated, cycle.adapting = valid, state.saturated, measurement.adapt
 

@@ -98,6 +98,20 @@ def report(
 
 
 @app.command()
+def replay(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory, or a log in it.")],
+    controller: Annotated[
+        Path | None, typer.Option(metavar="BENCH.toml", help="Ask this bench's controller instead: how far are its commands?")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
+) -> int:
+    """Feed a log's inputs through its controller again, and compare every command and state bit for bit."""
+    from softloop.deploy.replay import replay_run
+
+    return replay_run(run, controller, as_json=as_json)
+
+
+@app.command()
 def warm(quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False) -> int:
     """Compile every kernel once; later starts load them from the cache."""
     from softloop.deploy.prepare import warm as warm_all

@@ -1,4 +1,4 @@
-"""Progress of compiling kernels, on a terminal only, and only when there is something to wait for."""
+"""Progress of compiling kernels and of reading a long log, on a terminal only, and only when there is something to wait for."""
 
 from __future__ import annotations
 
@@ -24,3 +24,15 @@ def compile_progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]
             bar.update(task, completed=done, total=total, description=f"compiling {module.removeprefix('softloop.')}")
 
         yield show
+
+
+@contextmanager
+def tick_progress(*, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """A function `progress(done, total)` that shows how many ticks are done."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("replaying ticks", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -36,8 +36,7 @@ def make_config(
         "listen/timeout_ms": 0,
         "connect/endpoints": connect,
         "connect/exit_on_failure": False,
-        # A peer keeps trying in the background for ever (-1), also after a router went away; a client needs its router to open.
-        "connect/timeout_ms": CLIENT_PATIENCE_MS if mode == "client" else -1,
+        "connect/timeout_ms": _patience_ms(mode, listen_must_work=listen_must_work),
         # 20 to 100 ms: a router that came back is found again well within the 2 s a rig may be without one.
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
         "open/return_conditions/connect_scouted": False,
@@ -53,6 +52,17 @@ def make_config(
     for name, value in settings.items():
         config.insert_json5(name, json.dumps(value))
     return config
+
+
+def _patience_ms(mode: str, *, listen_must_work: bool) -> int:
+    """What Zenoh's connect timeout is to be.
+
+    A client needs its router to open. A peer keeps trying in the background, for ever (-1): also before its router is there and
+    after it went away. A guest, who may be the meeting point itself, tries once while it opens (0), so that it can send at once.
+    """
+    if mode == "client":
+        return CLIENT_PATIENCE_MS
+    return -1 if listen_must_work else 0
 
 
 def own_endpoint(meeting_point: str, process: str) -> str:
