@@ -36,12 +36,13 @@ class Rig:
         ]
         # Sockets go into the folder of this test, not among those of the user's own benches.
         environment = {**os.environ, "XDG_RUNTIME_DIR": str(runtime or self.folder)}
-        self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True, env=environment
-        )
+        self.words = self.folder / "output.txt"
+        with self.words.open("w") as output:
+            self.process = subprocess.Popen(
+                command, stdout=output, stderr=subprocess.STDOUT, start_new_session=True, env=environment
+            )
         self.started = time.monotonic()
         self.family = {}
-        self.output = ""
 
     def children(self):
         """Process name -> psutil.Process of the rig's processes that run now."""
@@ -61,28 +62,24 @@ class Rig:
         while not condition():
             list(self.children())
             assert time.monotonic() - self.started < LIMIT_S, f"{what}: not within {LIMIT_S} s\n{self.logs()}"
-            assert self.process.poll() is None, f"the rig ended before: {what}\n{self.process.stdout.read()}\n{self.logs()}"
+            assert self.process.poll() is None, f"the rig ended before: {what}\n{self.output}\n{self.logs()}"
             time.sleep(0.05)
 
     def wait_for_word(self, word):
         """Wait until the launcher has printed `word`."""
-        os.set_blocking(self.process.stdout.fileno(), False)
+        self.wait_for(lambda: word in self.output, f"the word '{word}'")
 
-        def seen():
-            self.output += self.process.stdout.read() or ""
-            return word in self.output
-
-        self.wait_for(seen, f"the word '{word}' in: {self.output}")
+    @property
+    def output(self):
+        """What the launcher has printed so far."""
+        return self.words.read_text()
 
     def finish(self):
         """Wait for the end; returns the exit code."""
-        list(self.children())
-        os.set_blocking(self.process.stdout.fileno(), True)
-        try:
-            left = LIMIT_S - (time.monotonic() - self.started)
-            self.output += self.process.communicate(timeout=max(1.0, left))[0]
-        except subprocess.TimeoutExpired:
-            raise AssertionError(f"the rig did not end\n{self.output}\n{self.logs()}") from None
+        while self.process.poll() is None:
+            list(self.children())
+            assert time.monotonic() - self.started < LIMIT_S, f"the rig did not end\n{self.output}\n{self.logs()}"
+            time.sleep(0.1)
         return self.process.returncode
 
     def signal(self, number):
@@ -112,7 +109,7 @@ class Rig:
                 process.send_signal(signal.SIGCONT)
                 process.kill()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.communicate(timeout=10)
+            self.process.wait(timeout=10)
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
