@@ -7,7 +7,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.softloop-is-installed
-SOURCES := wire dynamics devices plant controller watch offline deploy tests benchmarks
+SOURCES := wire dynamics devices plant controller watch offline deploy tests benchmarks docs
 
 .PHONY: help setup demo test lint lock clean
 
@@ -38,7 +38,7 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/softloop warm
 	$(BIN)/python -m pytest -m 'not rig'
-	$(BIN)/python -m pytest -m rig || test $$? -eq 5
+	$(BIN)/python -m pytest -m rig
 
 lint: $(STAMP)
 	$(BIN)/ruff check $(SOURCES)

@@ -39,7 +39,7 @@ class ValvesConfig(Table):
     age_ticks: int = Field(3, ge=0, le=20, description="slack in the sensors' age budgets")
     command_wait_ms: float = Field(1.5, gt=0, le=5, description="a command later than this costs its tick")
     driver_silence_ms: float = Field(20.0, ge=5, le=1000, description="without a good status frame for this long: a fault")
-    driver_max_lost: int = Field(3, ge=1, le=13, description="status frames that may be missing in a row")
+    driver_max_lost: int = Field(3, ge=1, le=13, description="so many status frames lost in a row make the next one refused")
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> ValvesConfig:

@@ -11,14 +11,16 @@ from mcap_ros2.decoder import DecoderFactory
 
 from softloop.deploy.bench import shipped_benches
 from softloop.offline.log import open_log
-from softloop.offline.metrics import truth_errors
+from softloop.offline.metrics import truth_errors, while_armed
 from softloop.wire.channels import CHANNELS
 from softloop.wire.messages import constant
 from tests.rig.rigs import running
 
 pytestmark = pytest.mark.rig
 
-SIM = f'base = "{shipped_benches()["sim"]}"\n'
+# These tests are about what the processes do, on a machine that may be busy: budgets are wide, so that a stall of the machine is
+# no fault of the rig's. What the default budgets stand is measured elsewhere.
+WIDE = "[valves]\nage_ticks = 16\nhold_ticks = 12\ndriver_silence_ms = 100.0\n[plant]\nwatchdog_ms = 100.0\n"
 SHORT = '[controller]\ntrajectory = "{bench_dir}/short.csv"\napproach_s = 2.0\n'
 ARMED = "gate armed"
 
@@ -29,10 +31,16 @@ def short_csv(rig_folder):
     np.savetxt(rig_folder / "short.csv", rows, delimiter=",", header="t_s,angle_deg")
 
 
+def bench_on(shipped, folder):
+    """The text of a bench on a shipped one, with wide budgets and a trajectory of 4 s."""
+    short_csv(folder)
+    (folder / "wide.toml").write_text(f'base = "{shipped_benches()[shipped]}"\n{WIDE}')
+    return f'base = "{folder}/wide.toml"\n' + SHORT.replace("{bench_dir}", str(folder))
+
+
 @pytest.fixture
 def short_bench(tmp_path):
-    short_csv(tmp_path)
-    return SIM + SHORT.replace("{bench_dir}", str(tmp_path))
+    return bench_on("sim", tmp_path)
 
 
 @pytest.mark.parametrize("law", ["arc", "pid"])
@@ -112,9 +120,11 @@ def test_a_stopped_recorder_does_not_hold_the_loop(short_bench):
         time.sleep(3.0)
         recorder.resume()
         assert rig.finish() == 0, rig.output + rig.logs()
-        cycles = open_log(rig.run_dir / "run.mcap")["cycle"]
-        # All ticks of the stall ran: their numbers go on without a leap, though their records may be missing in the log.
-        assert cycles["skipped_total"][-1] <= 20
+        log = open_log(rig.run_dir / "run.mcap")
+        cycles = while_armed(log, log["cycle"])
+        # The ticks of the stall ran, though their records may be missing in the log; a publisher that waits would have stood
+        # still for seconds, hundreds of ticks.
+        assert cycles["skipped_total"][-1] - cycles["skipped_total"][0] < 100
         assert cycles["tick"][-1] - cycles["tick"][0] == pytest.approx(
             (cycles["stamp_ns"][-1] - cycles["stamp_ns"][0]) / 5e6, abs=1
         )
@@ -126,10 +136,10 @@ def free_port():
         return probe.getsockname()[1]
 
 
-def test_the_same_over_slcan_and_a_socket_with_no_code_that_knows(short_bench):
-    text = short_bench.replace(str(shipped_benches()["sim"]), str(shipped_benches()["slcan"]))
+def test_the_same_over_slcan_and_a_socket_with_no_code_that_knows(tmp_path):
     port = free_port()
-    text += f'[plant]\nserial = "listen://127.0.0.1:{port}"\n[inclinometer]\nport = "socket://127.0.0.1:{port}"\n'
+    text = bench_on("slcan", tmp_path) + f'[plant]\nserial = "listen://127.0.0.1:{port}"\n'
+    text += f'[inclinometer]\nport = "socket://127.0.0.1:{port}"\n'
     with running(text, name="slcan") as rig:
         assert rig.finish() == 0, rig.output + rig.logs()
         log = open_log(rig.run_dir / "run.mcap")
