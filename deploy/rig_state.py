@@ -84,9 +84,9 @@ class RigState:
         return max(0, self.cycle.trajectory_ns) * 1e-9 if tracking else 0.0
 
     def vented(self, vented_kpa: float) -> bool:
-        """The gate says that venting is over, or the chamber's pressure is gone."""
-        if self.valves is not None and self.valves.gate != GATE_ARMED and self.valves.output == OUTPUT_CLOSED:
-            return True
+        """The gate says that venting is over; where no gate speaks, the chamber's pressure is gone."""
+        if self.valves is not None:
+            return bool(self.valves.gate != GATE_ARMED and self.valves.output == OUTPUT_CLOSED)
         return self.pressure is not None and self.pressure.chamber_pressure_kpa < vented_kpa
 
     def event_line(self, event: Any) -> str:

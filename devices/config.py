@@ -29,6 +29,9 @@ class ValvesConfig(Table):
     overlap_ma: float = Field(70.0, ge=0, description="one of the two currents is always held at or below this")
     vent_current_ma: float = Field(200.0, gt=0, description="exhaust current while venting")
     vent_done_kpa: float = Field(2.0, ge=0, description="venting ends at this chamber pressure")
+    vent_settle_s: float = Field(
+        0.5, ge=0, le=10, description="and has stayed below it for so long: gas that expanded cold warms up and rises again"
+    )
     vent_again_kpa: float = Field(10.0, gt=0, description="and begins again above this one")
     vent_time_s: float = Field(10.0, gt=0, description="or after this time, unless vent_again_kpa is seen")
     pressure_max_kpa: float = Field(190.0, gt=0, description="chamber pressure; above it is a fault")

@@ -76,6 +76,7 @@ GATE_CONFIG = record_dtype([
     ("inclination_age_ns", _I8),
     ("driver_silence_ns", _I8),
     ("vent_time_ns", _I8),
+    ("vent_settle_ns", _I8),
     ("current_max_ma", _F8),
     ("slew_ma", _F8),               # per step
     ("overlap_ma", _F8),
@@ -123,6 +124,7 @@ GATE_STATE = record_dtype([
     ("pressure_stamp_ns", _I8),
     ("venting", _I8),
     ("vent_since_ns", _I8),
+    ("empty_since_ns", _I8),        # 0: the chamber is not known to be empty
     ("charge_ma", _F8),             # as sent last
     ("exhaust_ma", _F8),
     ("arm_origin", _I8, (REQUESTERS,)),
@@ -155,6 +157,7 @@ def gate_config(process: ValvesProcess) -> Any:
     config.pressure_age_ns, config.inclination_age_ns = process.pressure_age_ns, process.inclination_age_ns
     config.driver_silence_ns = round(valves.driver_silence_ms * 1e6)
     config.vent_time_ns = round(valves.vent_time_s * 1e9)
+    config.vent_settle_ns = round(valves.vent_settle_s * 1e9)
     config.slew_ma = valves.slew_ma_per_tick
     for name in ("current_max_ma", "overlap_ma", "vent_current_ma", "vent_done_kpa", "vent_again_kpa", "pressure_max_kpa"):
         config[name] = getattr(valves, name)
@@ -271,7 +274,11 @@ def vent_output(config: Any, state: Any, given: Any) -> int:
     """OUTPUT_VENT or OUTPUT_CLOSED of a gate that is not armed."""
     fresh = state.pressure_stamp_ns > 0 and given.now_ns - state.pressure_stamp_ns <= config.pressure_age_ns
     high = fresh and state.chamber_pressure_kpa > config.vent_again_kpa
-    empty = fresh and state.chamber_pressure_kpa <= config.vent_done_kpa
+    if not (fresh and state.chamber_pressure_kpa <= config.vent_done_kpa):
+        state.empty_since_ns = 0
+    elif state.empty_since_ns == 0:
+        state.empty_since_ns = given.now_ns
+    empty = state.empty_since_ns > 0 and given.now_ns - state.empty_since_ns >= config.vent_settle_ns
     if state.venting == 0 and high:
         state.venting, state.vent_since_ns = 1, given.now_ns
     elif state.venting == 1 and (empty or (given.now_ns - state.vent_since_ns >= config.vent_time_ns and not high)):

@@ -18,6 +18,9 @@ from softloop.wire.errors import BadFile
 from softloop.wire.messages import constant, names_of
 
 SUMMARY = "summary.json"
+# Which process, by its table in the bench file, speaks on a steady channel.
+SPOKEN_BY = {"pressure": "pressures", "inclination": "inclinometer", "command": "controller", "cycle": "controller"}
+SPOKEN_BY |= {"valves": "valves", "truth": "plant"}
 ACCOUNT = "recorder.json"
 LATE_MAX_MS = 2.0  # a plant that was behind the clock by more simulated another rig than the one that it stands for
 Value = float | int | str | bool | None
@@ -64,7 +67,7 @@ def _meanings() -> dict[str, str]:
         "mode_switches_dwell_per_s": "the same within dwells only",
         "messages": "messages in the log",
         "log_problems": "damaged or missing parts of the log file, separated by '; '",
-        "silent_channels": "channels whose messages end long before the others', separated by '; '",
+        "silent_channels": "channels whose messages end long before the others' or never came, separated by '; '",
         "recorder_dropped": "messages that the recorder dropped (backlog, storage, malformed); empty without recorder.json",
         "plant_late_max_ms": "the plant's worst lateness behind the clock while the gate was armed; empty without a plant",
         "plant_deadline_misses": "times at which it was late by more than 2 ms, while the gate was armed",
@@ -113,16 +116,20 @@ def evidence_problems(found: dict[str, Any]) -> list[str]:
         (found["missing_cycle"] > 0, f"{found['missing_cycle']} cycle records are missing"),
         (found["missing_truth"] > 0, f"{found['missing_truth']} truth records are missing"),
         (bool(found["log_problems"]), "the log file is damaged or unfinished"),
-        (bool(found["silent_channels"]), f"messages end early: {found['silent_channels']}"),
+        (bool(found["silent_channels"]), f"a channel is silent: {found['silent_channels']}"),
     )
     return [text for bad, text in checks if bad]
 
 
-def _from_bench_file(log: Log) -> dict[str, Value]:
+def _bench_tables(log: Log) -> dict[str, Any]:
     try:
-        controller = tomllib.loads(log.text("bench.toml")).get("controller", {})
+        return tomllib.loads(log.text("bench.toml"))
     except tomllib.TOMLDecodeError:
-        controller = {}
+        return {}
+
+
+def _from_bench_file(log: Log) -> dict[str, Value]:
+    controller = _bench_tables(log).get("controller", {})
     names = {key: controller.get(key) for key in ("law", "trajectory")} if isinstance(controller, dict) else {}
     return {key: value if isinstance(value, str) else None for key, value in names.items()}
 
@@ -174,7 +181,9 @@ def _latency(log: Log) -> dict[str, Value]:
 def _losses(log: Log) -> dict[str, Value]:
     found: dict[str, Value] = {"messages": 0, "log_problems": "; ".join(log.problems)}
     silent = metrics.fallen_silent(log).items()
-    found["silent_channels"] = "; ".join(f"{name} {seconds:.1f} s before the end" for name, seconds in silent)
+    tables = _bench_tables(log)
+    unheard = [f"{name} never heard" for name, table in SPOKEN_BY.items() if table in tables and not len(log[name])]
+    found["silent_channels"] = "; ".join([*(f"{name} {seconds:.1f} s before the end" for name, seconds in silent), *unheard])
     total = 0
     for name, (messages, missing, repeated) in metrics.losses(log).items():
         found |= {f"messages_{name}": messages, f"missing_{name}": missing, f"repeated_{name}": repeated}

@@ -34,7 +34,7 @@ class ZenohConfig(Table):
 
     mode: Literal["peer", "client"] = Field("peer", description="peer: direct links; client: all by way of the meeting point")
     endpoint: str = Field("", description="meeting point; empty: a Unix socket named after the bench")
-    lease_ms: int = Field(500, ge=50, le=60_000, description="a silent link is given up after this")
+    lease_ms: int = Field(5000, ge=50, le=60_000, description="a silent link is given up after this")
 
     @field_validator("endpoint")
     @classmethod

@@ -86,7 +86,7 @@ def open_router(config: ZenohConfig, bench: str) -> zenoh.Session:
     return _open(make_config("router", [meet], [], config.lease_ms), meet)
 
 
-def open_meeting(bench: str, endpoint: str, lease_ms: int = 500) -> zenoh.Session:
+def open_meeting(bench: str, endpoint: str, lease_ms: int = 5000) -> zenoh.Session:
     """A peer for one who comes alone: joins the meeting point, and is it where nobody else is."""
     name = f"guest-{time.monotonic_ns() & 0xFFFFFF:x}"
     config = make_config("peer", [endpoint, own_endpoint(endpoint, name)], [endpoint], lease_ms, listen_must_work=False)

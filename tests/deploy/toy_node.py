@@ -20,6 +20,7 @@ from softloop.wire.shell import run_process
 
 DISARMED, ARMED, FAULT = (constant("ValveStatus", f"GATE_{s}") for s in ("DISARMED", "ARMED", "FAULT"))
 STALE = constant("ValveStatus", "REASON_SENSOR_STALE")
+PASS, CLOSED = (constant("ValveStatus", f"OUTPUT_{s}") for s in ("PASS", "CLOSED"))
 TRAJECTORY_S = 0.5
 
 
@@ -83,7 +84,9 @@ class Gate(Idle):
         if self.gate == ARMED and self.wrong == "faults":
             self.gate, self.reason = FAULT, STALE
         kind = message("ValveStatus")
-        self.put(kind.pack(kind.make(seq=self.seq, stamp_ns=self.clock.now_ns(), gate=self.gate, reason=self.reason)))
+        output = PASS if self.gate == ARMED else CLOSED
+        status = kind.make(seq=self.seq, stamp_ns=self.clock.now_ns(), gate=self.gate, reason=self.reason, output=output)
+        self.put(kind.pack(status))
         self.armed_steps += self.gate == ARMED
         if self.armed_steps > 20 and self.wrong == "hangs_armed":
             os.kill(os.getpid(), signal.SIGSTOP)

@@ -17,7 +17,7 @@ class GateBench:
     """A gate with a living driver; each `tick` is one period and one step, with a good command unless told otherwise."""
 
     def __init__(self, **valves):
-        self.process = process(**valves)
+        self.process = process(**{"vent_settle_s": 0.0, **valves})
         self.config = g.gate_config(self.process)
         self.state, self.given, self.output = (new_record(d) for d in (g.GATE_STATE, g.GATE_INPUT, g.GATE_OUTPUT))
         self.now_ns = START_NS

@@ -205,6 +205,15 @@ def test_venting_goes_on_past_its_time_while_pressure_is_seen():
     assert bench.tick(chamber_pressure_kpa=9.0).output == g.OUTPUT_CLOSED
 
 
+def test_venting_ends_only_when_the_chamber_has_stayed_empty():
+    bench = GateBench(vent_settle_s=0.1)
+    empty = [int(bench.tick(chamber_pressure_kpa=1.0).output) for _ in range(19)]
+    assert bench.tick(chamber_pressure_kpa=3.0).output == g.OUTPUT_VENT  # gas that expanded cold has warmed up
+    again = [int(bench.tick(chamber_pressure_kpa=1.0).output) for _ in range(22)]
+    assert empty == [g.OUTPUT_VENT] * 19
+    assert again == [g.OUTPUT_VENT] * 20 + [g.OUTPUT_CLOSED] * 2
+
+
 def test_a_fault_vents_anew():
     bench = GateBench(vent_time_s=1.0)
     bench.tick(chamber_pressure_kpa=0.0)
