@@ -20,6 +20,8 @@ from softloop.wire.errors import Unavailable
 
 UNIX = "unixsock-stream/"
 CLIENT_PATIENCE_MS = 10_000
+SETTLED_S = 0.3  # no link came or went for so long
+SETTLE_AT_MOST_S = 3.0
 
 
 def make_config(
@@ -210,6 +212,23 @@ class Wire:
     def everything(self, capacity: int) -> Inbox:
         """All samples of all channels of the bench."""
         return Inbox(self.session, f"{ROOT}/{self.bench}/**", capacity)
+
+    def settle(self, stop: Callable[[], bool]) -> None:
+        """Return when the links to the meeting point and to the peers it tells of are up, or after a while without them.
+
+        What is declared in the very moment in which a link comes up can be lost on that link for good (seen in one start of
+        ten with six processes starting at once). So links come first, and declarations on a network that stands still.
+        """
+        deadline = time.monotonic() + SETTLE_AT_MOST_S
+        known: set[str] = set()
+        steady_since = time.monotonic()
+        while not stop() and time.monotonic() < deadline:
+            now = {str(zid) for zid in (*self.session.info.routers_zid(), *self.session.info.peers_zid())}
+            if now != known or not now:
+                known, steady_since = now, time.monotonic()
+            elif time.monotonic() - steady_since > SETTLED_S:
+                return
+            time.sleep(0.02)
 
     def declare_alive(self) -> None:
         """Show on the network that this process runs, until its session closes."""

@@ -92,6 +92,7 @@ def run_process(
     sys.setswitchinterval(5e-4)  # a waiting 5 ms loop gets the interpreter back soon after a Zenoh callback took it
     try:
         with open_wire(zenoh, bench, process) as wire:
+            wire.settle(lambda: bool(stop))
             body(Context(process, bench, run_dir, wire, stop=stop, realtime=granted))
     except SoftloopError as error:
         say(process, str(error))
