@@ -28,7 +28,7 @@ from numba import types
 
 from softloop.devices.config import PERIOD_NS, ValvesProcess
 from softloop.devices.protocols.quantise_kernels import counts_to_current, current_to_counts
-from softloop.wire.kernel import kernel, new_record, record_dtype, record_type
+from softloop.wire.kernel import array_of, kernel, new_record, record_dtype, record_type
 from softloop.wire.messages import constant
 
 _I8, _F8 = np.int64, np.float64
@@ -323,3 +323,9 @@ def gate_step(config: Any, state: Any, given: Any, output: Any) -> None:
     output.charge_current_ma = counts_to_current(output.charge_counts)
     output.exhaust_current_ma = counts_to_current(output.exhaust_counts)
     state.charge_ma, state.exhaust_ma = output.charge_current_ma, output.exhaust_current_ma
+
+
+@kernel(types.void(array_of(_CONFIG), array_of(_STATE), array_of(_INPUT), array_of(_OUTPUT)))
+def gate_step_of_arrays(config: np.ndarray, state: np.ndarray, given: np.ndarray, output: np.ndarray) -> None:
+    """`gate_step` on arrays of one record each: from Python a call with arrays costs a third of one with records."""
+    gate_step(config[0], state[0], given[0], output[0])

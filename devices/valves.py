@@ -6,6 +6,8 @@ valve frame. What happens without it: the driver's watchdog vents.
 
 from __future__ import annotations
 
+import numpy as np
+
 from softloop.devices import gate as g
 from softloop.devices.config import PERIOD_NS, ValvesProcess
 from softloop.devices.protocols import can_frames
@@ -14,7 +16,6 @@ from softloop.wire.can_config import open_port
 from softloop.wire.can_port import CanPort
 from softloop.wire.channels import COMMAND, REQUEST, VALVES
 from softloop.wire.errors import Lost
-from softloop.wire.kernel import new_record
 from softloop.wire.messages import BadPayload, constant, message, names_of
 from softloop.wire.shell import Context, say
 from softloop.wire.status import EventReporter, StatusReporter
@@ -57,8 +58,9 @@ class ValvesLoop:
     def __init__(self, config: ValvesProcess, context: Context, port: CanPort) -> None:
         self.context, self.clock, self.port = context, context.clock, port
         self.wait_ns = PERIOD_NS + round(config.valves.command_wait_ms * 1e6)
-        self.config = g.gate_config(config)
-        self.state, self.given, self.output = (new_record(d) for d in (g.GATE_STATE, g.GATE_INPUT, g.GATE_OUTPUT))
+        self.records = [np.zeros(1, d) for d in (g.GATE_CONFIG, g.GATE_STATE, g.GATE_INPUT, g.GATE_OUTPUT)]
+        self.records[0][0] = g.gate_config(config)
+        self.state, self.given, self.output = (record[0] for record in self.records[1:])  # views
         self.driver = can_frames.E2eReceiver(can_frames.VALVE_STATUS_ID, config.valves.driver_max_lost)
         self.driver_frame = can_frames.ValveStatusFrame(0, 0, 0, 0, 0)
         self.seq = self.tick = self.bus_offs = self.late_ns = 0
@@ -73,8 +75,7 @@ class ValvesLoop:
 
     def _warm(self) -> None:
         """Compile and load all that the loop uses, on records of its own."""
-        state, output = new_record(g.GATE_STATE), new_record(g.GATE_OUTPUT)
-        g.gate_step(self.config, state, self.given, output)
+        g.gate_step_of_arrays(self.records[0], *(record.copy() for record in self.records[1:]))
         data = can_frames.encode_valve_command(can_frames.ValveCommandFrame(0, 0, 0, 0, 0))
         can_frames.decode_valve_status(data)
 
@@ -151,7 +152,7 @@ class ValvesLoop:
     def step(self) -> None:
         """The gate's judgement, now."""
         self.given.now_ns = self.clock.now_ns()
-        g.gate_step(self.config, self.state, self.given, self.output)
+        g.gate_step_of_arrays(*self.records)
 
     def write(self) -> None:
         """One valve frame, then the word on it. Raises Lost when the bus went away, after saying so on Zenoh."""
