@@ -58,7 +58,8 @@ def measure_rig(bench: str, seconds: float) -> dict[str, Any]:
             "--duration",
             str(seconds),
         ]
-        subprocess.run([*command, "--no-report", "--quiet"], check=True, timeout=seconds + 120)
+        # A run that a stall of the machine ends early is measured as far as it went; the launcher says so itself.
+        subprocess.run([*command, "--no-report", "--quiet"], check=False, timeout=seconds + 120)
         log = open_log(next(run_dir.glob("*.mcap")))
     cycles = log["cycle"]
     hops = latencies_us(log, "inclination")
