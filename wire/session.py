@@ -217,7 +217,7 @@ class Wire:
         """Return when the links to the meeting point and to the peers it tells of are up, or after a while without them.
 
         What is declared in the very moment in which a link comes up can be lost on that link for good (seen in two
-        starts of some thirty, six processes starting at once). So links come first, and declarations on a network that stands still.
+        starts of some thirty, six processes at once). So links come first, and declarations on a network that stands still.
         """
         deadline = time.monotonic() + SETTLE_AT_MOST_S
         known: set[str] = set()
