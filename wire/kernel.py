@@ -1,15 +1,19 @@
 """The one way to compile: `@kernel(signature)`.
 
 numba's own cache looks at the file of the function it compiled, not at the files of the functions which that one calls; it
-would go on serving old physics after a callee in another file changed. So every kernel is cached in a folder whose name is
-a hash of all sources of the package, the numba and numpy versions and the CPU: any change makes a new folder.
+would go on serving old physics after a callee in another file changed. So the kernels of a module are cached in a folder whose
+name is a hash of all sources that the module can reach by imports, of all messages, the numba and numpy versions and the CPU:
+a change of any of them makes a new folder, and a change of what a kernel cannot reach leaves it compiled.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
+import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
@@ -22,14 +26,37 @@ _numba_config: Any = numba.config  # its attributes are made at import; the type
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-PACKAGE = Path(__file__).resolve().parent.parent
-KERNEL_ROOMS = ("wire", "dynamics", "devices", "plant", "controller", "offline")
+PACKAGE = Path(__file__).parent.parent  # as it was imported: the rooms may stand in it as links
+_MESSAGES = PACKAGE / "wire" / "msg"
+# `from x.y import (a, b)` and `import x.y`, at any depth of indentation.
+_IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([\w., \t]+))", re.MULTILINE)
 
 
-def sources(package: Path = PACKAGE) -> list[Path]:
-    """All files a kernel's meaning can depend on: Python sources and messages of the rooms with kernels."""
-    found = (p for room in KERNEL_ROOMS for end in ("*.py", "*.msg") for p in (package / room).rglob(end))
-    return sorted(found)
+@cache
+def imported_files(file: Path, root: Path) -> frozenset[Path]:
+    """The files under `root`, the folder of top-level packages and modules, that a source file itself imports."""
+    found: set[Path] = set()
+    for origin, names, plain in _IMPORT.findall(file.read_text(encoding="utf-8")):
+        wanted = [part.split()[0] for part in plain.split(",") if part.split()]
+        if origin:
+            wanted = [origin, *(f"{origin}.{name}" for name in re.findall(r"\w+", names))]
+        for dotted in wanted:
+            parts = dotted.split(".")
+            for length in range(1, len(parts) + 1):
+                base = root.joinpath(*parts[:length])
+                found.update(p for p in (base.with_suffix(".py"), base / "__init__.py") if p.is_file())
+    return frozenset(found)
+
+
+def sources_of(file: Path, root: Path | None = None) -> list[Path]:
+    """A source file, all under `root` that it can reach by imports, and the messages: what its kernels can depend on."""
+    root = root or PACKAGE.parent
+    reached, waiting = {file}, [file]
+    while waiting:
+        new = imported_files(waiting.pop(), root) - reached
+        reached |= new
+        waiting.extend(new)
+    return [*sorted(reached), *sorted(_MESSAGES.glob("*.msg"))]
 
 
 def source_hash(files: list[Path]) -> str:
@@ -48,7 +75,17 @@ def cache_root() -> Path:
     return Path(base) / "softloop" / "kernels"
 
 
-CACHE_DIR = cache_root() / source_hash(sources())
+@cache
+def cache_dir(file: Path, root: Path) -> Path:
+    """The folder of the compiled kernels that stand in a source file."""
+    return cache_root() / f"{file.stem}-{source_hash(sources_of(file, root))}"
+
+
+def _home(function: Callable[..., Any]) -> tuple[Path, Path]:
+    """The file of the module that calls for `function` to be compiled, and the folder of its top-level package or module."""
+    module = sys.modules[sys._getframe(2).f_globals["__name__"]]
+    file = Path(module.__file__ or function.__code__.co_filename)
+    return file, file.parents[module.__name__.count(".")]
 
 
 def kernel(*signatures: Any) -> Callable[[F], F]:
@@ -60,7 +97,7 @@ def kernel(*signatures: Any) -> Callable[[F], F]:
 
     def decorate(function: F) -> F:
         before = _numba_config.CACHE_DIR
-        _numba_config.CACHE_DIR = str(CACHE_DIR)
+        _numba_config.CACHE_DIR = str(cache_dir(*_home(function)))
         try:
             compiled = numba.njit(list(signatures), cache=True, nogil=True, error_model="numpy", fastmath=False)(function)
         finally:

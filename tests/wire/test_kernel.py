@@ -3,11 +3,13 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 from numba import types
 
-from softloop.wire.kernel import kernel, new_record, record_dtype, record_type, source_hash, sources
+from softloop.plant import physics
+from softloop.wire.kernel import kernel, new_record, record_dtype, record_type, source_hash, sources_of
 
 INNER = record_dtype([("gain", "f8"), ("table", "f8", (3,))])
 OUTER = record_dtype([("inner", INNER), ("n", "i8")])
@@ -38,22 +40,29 @@ def test_division_by_zero_is_as_in_numpy():
     assert np.isnan(divide(0.0, 0.0))
 
 
-def test_the_hash_sees_every_source(tmp_path):
-    one, two = tmp_path / "a.py", tmp_path / "b.py"
-    one.write_text("x = 1")
-    two.write_text("y = 1")
-    before = source_hash([one, two])
-    assert source_hash([one, two]) == before
-    two.write_text("y = 2")
-    assert source_hash([one, two]) != before
-    assert any(p.name == "bending.py" for p in sources())
+def test_the_hash_sees_all_that_a_module_reaches_and_nothing_else(tmp_path):
+    one, two, three, four = (tmp_path / f"{name}.py" for name in ("one", "two", "three", "four"))
+    one.write_text("from two import (\n    x,\n    y,\n)\n")
+    two.write_text("def f():\n    import three\n\nx = y = 1")
+    three.write_text("z = 1")
+    four.write_text("w = 1")
+    before = source_hash(sources_of(one, tmp_path))
+    assert source_hash(sources_of(one, tmp_path)) == before
+    four.write_text("w = 2")
+    assert source_hash(sources_of(one, tmp_path)) == before
+    three.write_text("z = 2")
+    assert source_hash(sources_of(one, tmp_path)) != before
+
+
+def test_a_kernel_reaches_callees_in_other_rooms_and_the_messages():
+    reached = {path.name for path in sources_of(Path(physics.__file__))}
+    assert {"physics.py", "air.py", "gas.py", "PlantTruth.msg", "kernel.py"} <= reached
+    assert "recorder.py" not in reached
 
 
 CALLER = """
 import sys; sys.path.insert(0, {folder!r})
-from pathlib import Path
-import softloop.wire.kernel as k
-k.CACHE_DIR = Path({folder!r}) / "cache" / k.source_hash(sorted(Path({folder!r}).glob("*.py")))
+import os; os.environ["XDG_CACHE_HOME"] = {folder!r}
 import caller
 print(caller.outer(1.0))
 """
