@@ -40,7 +40,8 @@ class ControllerLoop:
         wire = context.wire
         self.controller = controller
         self.clock = context.clock
-        self.inputs = [self._input(wire.latest(c), name) for c, name in _INPUTS]
+        pace = context.pace
+        self.inputs = [self._input(pace.newest(wire.latest(c), *source), name) for c, name, source in _INPUTS]
         self.put_command, self.put_cycle = wire.publisher(COMMAND), wire.publisher(CYCLE)
         self.status = StatusReporter(context, _SOURCE)
         self.events = EventReporter(context, _SOURCE)
@@ -111,5 +112,10 @@ class ControllerLoop:
         self.status.close()
 
 
-_INPUTS = ((PRESSURE, "pressure"), (INCLINATION, "inclination"), (VALVES, "valves"))
+# Channel, field of `INPUTS`, and who sends it, the gate one tick after.
+_INPUTS = (
+    (PRESSURE, "pressure", ("pressures",)),
+    (INCLINATION, "inclination", ("inclinometer",)),
+    (VALVES, "valves", ("valves", 1)),
+)
 INPUT_MESSAGES = {"pressure": PRESSURE.message, "inclination": INCLINATION.message, "valves": VALVES.message}

@@ -24,7 +24,7 @@ from softloop.plant.config import PlantConfig, plant_process
 from softloop.watch.config import RecorderConfig
 from softloop.wire.benchfile import Table, load_model, read_toml, validated
 from softloop.wire.can_config import CanConfig
-from softloop.wire.config import HostConfig, ZenohConfig
+from softloop.wire.config import HostConfig, PaceConfig, ZenohConfig
 from softloop.wire.errors import BadConfig, BadFile
 
 NAME = r"^[a-z0-9_-]{1,24}$"
@@ -42,6 +42,7 @@ class Bench(Table):
     name: str = Field(pattern=NAME, description="part of every Zenoh key: a-z, 0-9, _ and -, at most 24")
     zenoh: ZenohConfig = ZenohConfig()
     host: HostConfig = HostConfig()
+    pace: PaceConfig = PaceConfig()
     run: RunConfig = RunConfig()
     can: dict[str, CanConfig] = Field(default_factory=dict)
     plant: PlantConfig | None = None
@@ -149,6 +150,19 @@ def _check_together(bench: Bench, source: Source) -> None:
             key = re.search(r"key '([^']+)'", str(error))
             where = tuple(key[1].split(".")) if key else (name,)
             raise BadConfig(f"{source.origin(where)}: {error}") from None
+    if bench.pace.mode == "lockstep":
+        _check_lockstep(bench, source)
+
+
+def _check_lockstep(bench: Bench, source: Source) -> None:
+    """What waits for real time cannot be in a run that stands still while it waits. Raises BadConfig."""
+    if bench.plant is None or bench.valves is None or bench.controller is None:
+        raise BadConfig(
+            f"{source.file}: key 'pace.mode': lockstep needs the tables [plant], [valves] and [controller]: "
+            "real devices do not wait for a tick"
+        )
+    if bench.inclinometer is not None and bench.inclinometer.configure:
+        raise BadConfig(f"{source.file}: key 'inclinometer.configure': must be false at lockstep pace")
 
 
 def _chain(path: Path) -> list[tuple[Path, dict[str, Any]]]:

@@ -36,12 +36,16 @@ def run(
     duration: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="End after S seconds, armed.")] = None,
     no_report: Annotated[bool, typer.Option("--no-report", help="Leave out the report at the end.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False,
+    pace: Annotated[
+        Literal["wall", "lockstep"] | None,
+        typer.Option(help="Instead of the bench file's: by the clock, or tick by tick."),
+    ] = None,
 ) -> int:
     """Run a bench: start its processes, arm, watch, vent, stop, summary and report."""
     from softloop.deploy.bench import find_bench
     from softloop.deploy.launcher import Options, launch
 
-    options = Options(run_dir=run_dir, duration_s=duration, report=False if no_report else None, quiet=quiet)
+    options = Options(run_dir=run_dir, duration_s=duration, report=False if no_report else None, quiet=quiet, pace=pace)
     return launch(find_bench(bench), options)
 
 
@@ -109,6 +113,18 @@ def replay(
     from softloop.deploy.replay import replay_run
 
     return replay_run(run, controller, as_json=as_json)
+
+
+@app.command()
+def same(
+    first: Annotated[Path, typer.Argument(metavar="RUN_A", help="A run directory, or a log in it.")],
+    second: Annotated[Path, typer.Argument(metavar="RUN_B", help="Another one.")],
+    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
+) -> int:
+    """Compare two logs channel by channel, byte by byte: runs at lockstep pace come out the same."""
+    from softloop.deploy.same import same_runs
+
+    return same_runs(first, second, as_json=as_json)
 
 
 @app.command()

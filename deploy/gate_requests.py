@@ -25,17 +25,19 @@ FIND_GATE_S = 3.0  # a gate speaks every 5 ms; joining takes well under a second
 class Requests:
     """One requester: its random name on the wire, and its count."""
 
-    def __init__(self, wire: Wire) -> None:
+    def __init__(self, wire: Wire, origin: int = 0) -> None:
+        """`origin`: a number of its own, not 0; random unless given."""
         self._put = wire.publisher(REQUEST)
-        self._origin = secrets.randbits(63)
+        self._origin = origin or secrets.randbits(63)
         self._seq = 0
 
-    def send(self, action: Action) -> None:
-        """Publish one request."""
+    def send(self, action: Action, stamp_ns: int | None = None) -> None:
+        """Publish one request, stamped now unless `stamp_ns` says when it is to hold (lockstep pace)."""
         self._seq += 1
         request = message("GateRequest")
         code = constant("GateRequest", f"ACTION_{action.upper()}")
-        self._put(request.pack(request.make(seq=self._seq, stamp_ns=time.monotonic_ns(), origin=self._origin, action=code)))
+        stamp_ns = time.monotonic_ns() if stamp_ns is None else stamp_ns
+        self._put(request.pack(request.make(seq=self._seq, stamp_ns=stamp_ns, origin=self._origin, action=code)))
 
 
 def ask(

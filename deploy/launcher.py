@@ -9,6 +9,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
+from typing import Literal
 
 from softloop.deploy.bench import Bench, load_bench
 from softloop.deploy.children import Child, Children
@@ -22,12 +23,15 @@ from softloop.deploy.rig_state import GATE_FAULT, RigState
 from softloop.deploy.router import launcher_wire, remove_sockets
 from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench, make_run_dir
 from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, BadConfig
+from softloop.wire.lockstep import Lockstep
+from softloop.wire.schedule import LAUNCHER_ORIGIN, Schedule, make_schedule
 from softloop.wire.session import Wire
 from softloop.wire.shell import Stop
 
 POLL_S = 0.1
 # The gate speaks 200 times a second; a second of silence, far above any pause of a healthy machine, is a hung process.
 GATE_SILENT_NS = 1_000_000_000
+AFTER_S = 0.1  # lockstep pace: from the end of the trajectory to disarming
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,7 @@ class Options:
     duration_s: float | None = None
     report: bool | None = None
     quiet: bool = False
+    pace: Literal["wall", "lockstep"] | None = None
 
 
 def launch(bench_file: Path, options: Options) -> int:
@@ -66,7 +71,8 @@ def launch(bench_file: Path, options: Options) -> int:
         with compile_progress(quiet=options.quiet) as progress:
             prepared = prepare_in_child(run_dir / BENCH_FILE, run_dir, stop, progress)
         with launcher_wire(bench) as wire, closing(make_view(prepared.trajectory_s, quiet=options.quiet)) as view:
-            outcome = Launch(bench, run_dir, wire, view, stop, Children()).run()
+            kind = Launch if bench.pace.mode == "wall" else LockstepLaunch
+            outcome = kind(bench, run_dir, wire, view, stop, Children(), prepared.trajectory_s).run()
         return conclude(bench, run_dir, outcome.code, outcome.text, began=outcome.began, quiet=options.quiet)
 
 
@@ -77,7 +83,8 @@ def _with_options(bench: Bench, options: Options) -> Bench:
         changed["duration_s"] = options.duration_s
     if options.report is not None:
         changed["report"] = options.report
-    return bench.model_copy(update={"run": bench.run.model_copy(update=changed)})
+    paced = bench.pace if options.pace is None else bench.pace.model_copy(update={"mode": options.pace})
+    return bench.model_copy(update={"run": bench.run.model_copy(update=changed), "pace": paced})
 
 
 @contextmanager
@@ -100,8 +107,11 @@ def stop_on_signals() -> Iterator[Stop]:
 class Launch:
     """One run of a bench, from the first process started to the last one gone."""
 
-    def __init__(self, bench: Bench, run_dir: Path, wire: Wire, view: View, stop: Stop, children: Children) -> None:
+    def __init__(
+        self, bench: Bench, run_dir: Path, wire: Wire, view: View, stop: Stop, children: Children, trajectory_s: float = 0.0
+    ) -> None:
         self.bench = bench
+        self.trajectory_s = trajectory_s
         self.run_dir = run_dir
         self.wire = wire
         self.view = view
@@ -232,3 +242,58 @@ class Launch:
 
     def _show(self, stage: str) -> None:
         self.view.show(stage, self.state, self.words)
+
+
+class LockstepLaunch(Launch):
+    """A run at lockstep pace: planned beforehand, tick by tick, and over when the plant has taken the last one."""
+
+    def _until_over(self) -> Outcome:
+        self._start()
+        return self._wait_alive() or self._conduct() or self._watch_ticks()
+
+    def _conduct(self) -> Outcome | None:
+        """Hand the gate its requests beforehand, and give the word to begin."""
+        schedule = schedule_of(self.bench, self.trajectory_s)
+        pace = Lockstep(self.bench.pace, self.wire, self.stop, set(self.words))
+        pace.meet(pace.others, None)
+        requests = Requests(self.wire, LAUNCHER_ORIGIN)
+        if self.bench.run.arm:
+            requests.send("arm", schedule.arm_ns)
+            requests.send("disarm", schedule.disarm_ns)
+            pace.board.wait(lambda: pace.board.marks["valves"].requests >= 2, lambda: "'valves', which has two requests to take")
+        pace.board.wait(lambda: pace.board.tick is not None, lambda: "'plant'", lambda: pace.say(0, schedule.ticks))
+        return self._trouble()
+
+    def _watch_ticks(self) -> Outcome:
+        while True:
+            self._refresh("running")
+            trouble = self._trouble()
+            if trouble is not None:
+                return trouble
+            if all(child.exit_code() == EXIT_OK for name, child in self.children.all.items() if name != "recorder"):
+                return self._over()
+            self.stop.wait(POLL_S)
+
+    def _over(self) -> Outcome:
+        self._refresh("running")
+        if self.state.gate == GATE_FAULT:
+            return Outcome(EXIT_NEGATIVE, f"the gate went to FAULT: {self.state.reason}")
+        if self.bench.run.arm and not self.state.was_armed:
+            return Outcome(EXIT_NEGATIVE, f"the gate was not armed: {self.children.all['valves'].last_line()}")
+        return Outcome(EXIT_OK, "the run is over, tick by tick")
+
+    def _trouble(self) -> Outcome | None:
+        if self.stop:
+            return Outcome(EXIT_INTERRUPTED, f"interrupted ({self.stop.reason})")
+        lost = next((c for c in self.children.all.values() if c.exit_code() not in (None, EXIT_OK)), None)
+        return None if lost is None else self._lost(lost)
+
+    def _vented(self, outcome: Outcome) -> Outcome:
+        return outcome  # venting is part of the plan
+
+
+def schedule_of(bench: Bench, trajectory_s: float) -> Schedule:
+    """The plan of a run: settle, arm, follow the trajectory (or `[run] duration_s`), disarm, vent."""
+    approach_s = bench.controller.approach_s if bench.controller is not None else 0.0
+    armed_s = bench.run.duration_s or approach_s + trajectory_s + AFTER_S
+    return make_schedule(bench.run.settle_s, armed_s, bench.run.vent_timeout_s)

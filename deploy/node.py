@@ -8,7 +8,9 @@ from pathlib import Path
 
 from softloop.deploy.bench import PROCESS_NAMES, Bench, load_bench, process_config
 from softloop.wire.errors import BadConfig
-from softloop.wire.shell import Context, run_process
+from softloop.wire.pace import Pace
+from softloop.wire.session import Wire
+from softloop.wire.shell import Context, Stop, run_process
 
 
 @dataclass(frozen=True)
@@ -76,4 +78,15 @@ def run_node(name: str, bench_file: Path, run_dir: Path, lifeline_fd: int | None
         run_dir=run_dir,
         lifeline_fd=lifeline_fd,
         realtime=process.realtime,
+        pace_of=lambda wire, stop: make_pace(bench, name, wire, stop),
     )
+
+
+def make_pace(bench: Bench, name: str, wire: Wire, stop: Stop) -> Pace:
+    """How the process `name` keeps time on this bench."""
+    if bench.pace.mode == "wall":
+        return Pace()
+    from softloop.wire.lockstep import Follower, Leader  # noqa: PLC0415 - no rig at wall pace needs it
+
+    others = {p.name for p in processes_of(bench)} - {name}
+    return (Leader if name == "plant" else Follower)(bench.pace, wire, stop, others)

@@ -9,6 +9,7 @@ from softloop.devices.protocols.quantise import counts_to_deg, counts_to_deg_s
 from softloop.wire.channels import INCLINATION
 from softloop.wire.errors import Lost, Unavailable
 from softloop.wire.messages import constant, message
+from softloop.wire.pace import WIRE_INCLINOMETER
 from softloop.wire.shell import Context, say
 from softloop.wire.status import EventReporter, StatusReporter
 
@@ -67,10 +68,11 @@ class InclinometerLoop:
         self.put = context.wire.publisher(INCLINATION)
         self.status, self.events = StatusReporter(context, _SOURCE), EventReporter(context, _SOURCE)
         self.rate = RateWatch(config)
+        self.bytes = context.pace.bytes(self, WIRE_INCLINOMETER)
 
     def turn(self) -> None:
         """Wait for bytes, publish what they bring, keep time. Raises Unavailable on a wrong rate from the start."""
-        data = self._read()
+        data = self.bytes.read(_WAIT_S)
         now_ns = self.clock.now_ns()
         for sample in self.sampler.feed(data, now_ns) if data else ():
             self._publish(sample)
@@ -79,12 +81,13 @@ class InclinometerLoop:
             say(self.context.process, word)
         self.status.cycle()
 
-    def _read(self) -> bytes:
+    def read(self, timeout_s: float) -> bytes:
+        """What has come, waiting up to `timeout_s`; over losses of the port."""
         if self.source is None:
             self._reopen()
             return b""
         try:
-            return self.source.read(_WAIT_S)
+            return self.source.read(timeout_s)
         except Lost as error:
             say(self.context.process, f"{error}; trying to open it again")
             self._note(lost=True)

@@ -11,6 +11,7 @@ from softloop.wire.can_frame import CanFrame
 from softloop.wire.can_port import CanPort
 from softloop.wire.channels import PRESSURE
 from softloop.wire.messages import constant, message
+from softloop.wire.pace import WIRE_ANALOG
 from softloop.wire.shell import Context, say
 from softloop.wire.status import EventReporter, StatusReporter
 
@@ -31,9 +32,10 @@ def run(config: PressuresProcess, context: Context) -> None:
     port = open_port(config.bus, config.pressures.can, context.wire, context.clock, [can_frames.ANALOG_INPUTS_ID])
     try:
         loop = PressuresLoop(config, context, port)
+        frames = context.pace.frames(port, WIRE_ANALOG)
         context.enter_loop()
         while not context.stop:
-            frame = port.recv(_WAIT_S)
+            frame = frames.recv(_WAIT_S)
             if frame is not None:
                 loop.take(frame)
             loop.keep_time()

@@ -17,6 +17,7 @@ from softloop.wire.can_port import CanPort
 from softloop.wire.channels import COMMAND, REQUEST, VALVES
 from softloop.wire.errors import Lost
 from softloop.wire.messages import BadPayload, constant, message, names_of
+from softloop.wire.pace import WIRE_DRIVER
 from softloop.wire.shell import Context, say
 from softloop.wire.status import EventReporter, StatusReporter
 
@@ -67,7 +68,9 @@ class ValvesLoop:
         self.said_driver, self.said_refusal, self.was_off = g.DRIVER_SILENT, 0, False
         self.lost: Lost | None = None
         self._warm()
-        self.commands, self.requests = context.wire.inbox(COMMAND), context.wire.inbox(REQUEST)
+        self.commands = context.pace.commands(context.wire.inbox(COMMAND))
+        self.requests = context.pace.requests(context.wire.inbox(REQUEST))
+        self.driver_frames = context.pace.frames(port, WIRE_DRIVER)
         self.put = context.wire.publisher(VALVES)
         self.status, self.events = StatusReporter(context, _SOURCE), EventReporter(context, _SOURCE)
         self.began_ns = self.clock.now_ns()
@@ -139,7 +142,7 @@ class ValvesLoop:
 
     def _read_bus(self) -> None:
         for _ in range(_FRAMES_AT_ONCE):
-            frame = self.port.recv(0.0)
+            frame = self.driver_frames.recv(0.0)
             if frame is None:
                 return
             data = frame.data[: frame.dlc]
@@ -163,9 +166,7 @@ class ValvesLoop:
         stamp_ns = self.clock.now_ns()
         if self.lost is None:
             try:
-                self.status.dropped += not self.port.send(
-                    can_frames.VALVE_COMMAND_ID, can_frames.encode_valve_command(frame), stamp_ns
-                )
+                self._send(can_frames.encode_valve_command(frame), stamp_ns)
             except Lost as error:
                 self.lost = error
         self._publish(stamp_ns)
@@ -173,6 +174,12 @@ class ValvesLoop:
         self.status.cycle(late_ns=self.late_ns, skipped=self.late_ns // PERIOD_NS)
         if self.lost is not None:
             raise self.lost
+
+    def _send(self, data: bytes, stamp_ns: int) -> None:
+        if self.port.send(can_frames.VALVE_COMMAND_ID, data, stamp_ns):
+            self.context.pace.note_sent(stamp_ns)
+        else:
+            self.status.dropped += 1
 
     def _publish(self, stamp_ns: int) -> None:
         given, output, driver = self.given, self.output, self.driver_frame

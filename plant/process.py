@@ -32,7 +32,7 @@ class Plant:
 
     def __init__(self, config: PlantProcess, context: Context) -> None:
         plant = config.plant
-        self._clock = context.clock
+        self._clock, self._pace = context.clock, context.pace
         self._device = new_device(plant)
         self._params = plant_record(plant, WireTimes(config.valves_bus.bitrate, config.analog_bus.bitrate))
         self._events = np.zeros(_EVENTS, EVENT)
@@ -62,8 +62,7 @@ class Plant:
     def turn(self) -> None:
         """Read, update, write, keep time."""
         self._can.take_commands(self._params, self._state)
-        late_ns = self._let_happen(self._clock.now_ns())
-        late_ns = max(late_ns, self._send_due(self._clock.now_ns()))
+        late_ns = max(self._let_happen(self._clock.now_ns()), self._send_due(self._clock.now_ns()))
         self._late_max_ns = max(self._late_max_ns, late_ns)
         self._misses += late_ns > LATE_NS
         self._status.cycle(late_ns)
@@ -76,7 +75,7 @@ class Plant:
 
     def _let_happen(self, now_ns: int) -> int:
         """Bring the rig to `now_ns`; returns how late the first happening was noticed."""
-        late_ns = max(0, now_ns - self._next_ns)
+        late_ns = self._pace.lateness_ns(self._next_ns)
         while self._state["reached_ns"] < now_ns:
             count = run_until(self._params, self._state, now_ns, self._events)
             for kind, sample_ns, end_ns, raw, value in self._events[:count].tolist():
@@ -105,9 +104,9 @@ class Plant:
         """Send what has come to its end on the wire by now; returns the worst lateness."""
         late_ns = 0
         for end_ns, kind, raw in self._outbox.take(now_ns):
-            late_ns = max(late_ns, now_ns - end_ns)
+            late_ns = max(late_ns, self._pace.lateness_ns(end_ns))
             if not self._can.send(kind, raw, end_ns):
-                self._serial.send(kind, raw)
+                self._serial.send(kind, raw, end_ns)
         return late_ns
 
 

@@ -29,6 +29,7 @@ from softloop.plant.inclinometer_device import InclinometerDevice
 from softloop.plant.records import EVENT_ANALOG_FRAME, EVENT_DRIVER_FRAME, EVENT_INCLINOMETER
 from softloop.plant.setup import configure_inclinometer
 from softloop.wire.can_config import CanConfig, open_port
+from softloop.wire.pace import WIRE_ANALOG, WIRE_DRIVER, WIRE_INCLINOMETER
 from softloop.wire.serial_urls import open_serial
 from softloop.wire.shell import Context
 
@@ -71,7 +72,7 @@ class CanSide:
 
     def __init__(self, config: PlantProcess, context: Context) -> None:
         plant = config.plant
-        self._clock = context.clock
+        self._clock, self._pace = context.clock, context.pace
         self._receiver = E2eReceiver(VALVE_COMMAND_ID, _MAX_DELTA)
         self._counter = 0
         self._valves = open_port(config.valves_bus, plant.can_valves, context.wire, context.clock, (VALVE_COMMAND_ID,))
@@ -79,12 +80,13 @@ class CanSide:
         if plant.can_analog != plant.can_valves:
             self._analog = open_port(config.analog_bus, plant.can_analog, context.wire, context.clock, ())
         self._frame_ns = can_frame_ns(DLC, config.valves_bus.bitrate)
+        self._commands = self._pace.valve_frames(self._valves, self._frame_ns)
         self._driver_stamp_ns = _time_before_end(config.valves_bus)
         self._analog_stamp_ns = _time_before_end(config.analog_bus)
 
     def take_commands(self, params: Any, state: Any) -> None:
         """Give the driver all valve frames that have come and are good."""
-        while (frame := self._valves.recv(0.0)) is not None:
+        while (frame := self._commands.recv(0.0)) is not None:
             if frame.flags or frame.arbitration_id != VALVE_COMMAND_ID:
                 continue
             data = bytes(frame.data[: frame.dlc])
@@ -100,9 +102,11 @@ class CanSide:
             status = ValveStatusFrame(self._counter, raw[2], raw[0], raw[1], raw[3])
             self._counter = next_counter(self._counter)
             self._valves.send(VALVE_STATUS_ID, encode_valve_status(status), end_ns - self._driver_stamp_ns)
+            self._pace.note_piece(WIRE_DRIVER, 1, end_ns)
         elif kind == EVENT_ANALOG_FRAME:
             data = encode_analog_inputs(AnalogFrame(raw[0], raw[1], raw[2]))
             self._analog.send(ANALOG_INPUTS_ID, data, end_ns - self._analog_stamp_ns)
+            self._pace.note_piece(WIRE_ANALOG, 1, end_ns)
         else:
             return False
         return True
@@ -123,7 +127,7 @@ class SerialSide:
 
     def __init__(self, plant: PlantConfig, context: Context, device: InclinometerDevice) -> None:
         url = plant.serial.replace("{run_dir}", str(context.run_dir.resolve()))
-        self._clock = context.clock
+        self._clock, self._pace = context.clock, context.pace
         self._device = device
         self._port = open_serial(url, plant.baud, 0.0)
 
@@ -138,11 +142,12 @@ class SerialSide:
         if answer:
             outbox.add(now_ns + serial_ns(len(answer), self._device.baud), _ANSWER, answer)
 
-    def send(self, kind: int, content: Any) -> None:
+    def send(self, kind: int, content: Any, end_ns: int) -> None:
         """Send what has come to its end; what the port does not take at once is lost, as on a line without a reader."""
         data = self._device.packets(content[2], content[0], content[1]) if kind == EVENT_INCLINOMETER else content
         with contextlib.suppress(serial.SerialTimeoutException):
             self._port.write(data)
+        self._pace.note_piece(WIRE_INCLINOMETER, len(data), end_ns)
 
     def close(self) -> None:
         self._port.close()

@@ -6,7 +6,7 @@ What it drops, it counts, by these rules:
   was written becomes invalid: the file goes on at the byte at which the disk refused;
 - malformed: a payload that is not the message of its channel is counted and not logged, because a log whose bytes do not fit
   their schema cannot be read by others;
-- unknown: a key that is no channel of the table, or one that is not logged.
+- unknown: a key that is no channel of the table.
 The first two are events in the log; the first three stand in `ProcessStatus.dropped`. At the end `recorder.json` in the run's
 directory says it all.
 """
@@ -23,7 +23,7 @@ from typing import Any
 from softloop.watch.config import RecorderConfig
 from softloop.wire.channels import CAN, EVENT, STATUS, Channel
 from softloop.wire.errors import Unavailable
-from softloop.wire.mcap_layout import BadMessage, LogWriter, attachments_of, logged_channel, read_origin, topic_of_key
+from softloop.wire.mcap_layout import BadMessage, LogWriter, attachments_of, known_channel, read_origin, topic_of_key
 from softloop.wire.messages import constant, message
 from softloop.wire.session import Inbox
 from softloop.wire.shell import Context, say
@@ -171,6 +171,8 @@ class Recorder:
         self._silent: set[str] = set()
         self._refused = False
         self._late_max_ns = 0
+        # At lockstep pace its word on itself, which is of this machine and moment, stands in its account alone.
+        self._speaks = not context.pace.exact
         self.store()
 
     def take(self) -> int:
@@ -181,6 +183,8 @@ class Recorder:
             channel = self._channel(full_key)
             if channel is None:
                 self.account.unknown += 1
+            elif not channel.logged:
+                continue
             elif full:
                 self.account.storage += 1
             else:
@@ -192,7 +196,7 @@ class Recorder:
         if full_key not in self._channels:
             if len(self._channels) > 10_000:  # CAN identifiers make keys; strangers' keys must not eat the memory
                 self._channels.clear()
-            self._channels[full_key] = logged_channel(self.context.bench, full_key)
+            self._channels[full_key] = known_channel(self.context.bench, full_key)
         return self._channels[full_key]
 
     def _write(self, full_key: str, channel: Channel, payload: bytes) -> None:
@@ -243,6 +247,8 @@ class Recorder:
 
     def report(self) -> None:
         """Once a second: drops as an event, and this process's status."""
+        if not self._speaks:
+            return
         lost = self.account.backlog + self.account.storage
         if lost > self._said_dropped:
             say(NAME, f"dropped {lost - self._said_dropped} messages")
@@ -313,13 +319,14 @@ def run(config: RecorderConfig, context: Context) -> None:
     next_flush_s = next_report_s = time.monotonic()
     while not context.stop:
         now_s = time.monotonic()
-        recorder.take()
+        context.pace.keep_up(recorder.take)
         if now_s >= next_flush_s:
             recorder.flush()
             next_flush_s = now_s + config.flush_s
         if now_s >= next_report_s:
             recorder.report()
-            recorder.listen_again()
+            if not context.pace.exact:  # there a channel may rest for as long as the slowest process needs
+                recorder.listen_again()
             next_report_s = now_s + STATUS_S
         recorder.keep_time(now_s)
     recorder.finish()

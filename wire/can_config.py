@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # reading a bench file needs none of these
     from softloop.wire.session import Wire
 
 _LOOK_AGAIN_S = 0.05
-_OWN_KEYS = ("interface", "channel", "bitrate", "can_filters", "session", "bench")
+_OWN_KEYS = ("interface", "channel", "bitrate", "can_filters", "session", "bench", "node", "congestion")
 
 
 class CanConfig(Table):
@@ -58,7 +58,8 @@ def open_bus(config: CanConfig, wire: Wire, receive: Sequence[int] | None = None
 
     arguments: dict[str, Any] = dict(config.options)
     if config.interface == "zenoh":
-        arguments |= {"session": wire.session, "bench": wire.bench}
+        name = str(config.channel)
+        arguments |= {"session": wire.session, "bench": wire.bench, "node": wire.node_on(name), "congestion": wire.congestion}
     if receive is not None:
         arguments["can_filters"] = [{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in receive]
     # Only what the bench file says: python-can's own configuration files and variables are left out.

@@ -25,7 +25,7 @@ import zenoh
 
 from softloop.wire.can_config import one_line
 from softloop.wire.can_frame import FLAG_ERROR, FLAG_EXTENDED, STANDARD_IDS, CanFrame, from_message, make_frame, state_after
-from softloop.wire.can_zenoh import FramePublisher, ZenohBus, random_node
+from softloop.wire.can_zenoh import FramePublisher, ZenohBus
 from softloop.wire.clock import Clock
 from softloop.wire.errors import Lost
 from softloop.wire.session import Wire
@@ -56,8 +56,8 @@ class CanPort:
         self._clock = clock
         self._send_timeout_s = send_timeout_s
         self._zenoh = bus if isinstance(bus, ZenohBus) else None
-        self._mirror = FramePublisher(wire.session, wire.bench, name) if mirror and self._zenoh is None else None
-        self._node = random_node()
+        self._mirror = FramePublisher(wire.session, wire.bench, name, wire.congestion) if mirror and self._zenoh is None else None
+        self._node = wire.node_on(name)
         self._seq = 0
         self._noise_run = 0
         self._state = can.BusState.ACTIVE

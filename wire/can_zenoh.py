@@ -46,6 +46,7 @@ DEFAULT_BENCH = "default"
 _CHUNK = re.compile(r"[^/*$?#@\s][^/*$?#\s]*")
 _MAX_PUBLISHERS = 2048  # all standard ids; whoever sends more extended ids than that pays for a put by name
 _MAX_SENDERS = 1024
+_DROP = zenoh.CongestionControl.DROP
 _SETTLE_S = 0.02  # measured: links to all others stand 1 to 3 ms after the meeting point answered
 _SETTLE_AT_MOST_S = 0.5
 _ANSWER_AT_MOST_S = 0.5
@@ -58,7 +59,7 @@ class FramePublisher:
     priority for itself, and of four frames handed over at once two were lost, where batched ones all arrived.
     """
 
-    def __init__(self, session: zenoh.Session, bench: str, channel: str) -> None:
+    def __init__(self, session: zenoh.Session, bench: str, channel: str, congestion: zenoh.CongestionControl = _DROP) -> None:
         self._session = session
         self._bench = bench
         self._channel = channel
@@ -66,7 +67,7 @@ class FramePublisher:
         self._qos: dict[str, Any] = {
             "encoding": "application/cdr",
             "priority": zenoh.Priority.REAL_TIME,
-            "congestion_control": zenoh.CongestionControl.DROP,
+            "congestion_control": congestion,
             "express": False,
         }
 
@@ -99,6 +100,8 @@ class ZenohBus(can.BusABC):
         receive_own_messages: also receive what this bus sends (with `is_rx` False).
         rx_queue_size: frames kept until they are received; when it is full the oldest go, counted in `dropped`.
         clock: where stamps come from; the machine's monotonic clock unless given.
+        node: this bus's number among the senders, not 0; random unless given.
+        congestion: wait for slow readers, or drop; drop unless given.
         **ignored: whatever else configuration files and other interfaces' users pass (bitrate, timing, ...).
 
     Raises:
@@ -121,6 +124,8 @@ class ZenohBus(can.BusABC):
         receive_own_messages: bool = False,
         rx_queue_size: int = 4096,
         clock: Clock | None = None,
+        node: int = 0,
+        congestion: zenoh.CongestionControl = _DROP,
         fd: bool = False,
         **ignored: Any,
     ) -> None:
@@ -132,7 +137,8 @@ class ZenohBus(can.BusABC):
         self._bench = _chunk("bench", bench)
         self._receive_own = bool(receive_own_messages)
         self._clock: Clock = clock or WallClock()
-        self._node = random_node()
+        self._node = node or random_node()
+        self._congestion = congestion
         self._seq = itertools.count(1)
         self._state = can.BusState.ACTIVE
         self._queue = FrameQueue(rx_queue_size)
@@ -150,7 +156,7 @@ class ZenohBus(can.BusABC):
     def _attach(self, session: Any) -> None:
         head = f"{ROOT}/{self._bench}/{CAN.name}/{self._channel}/"
         self._key_head = head
-        self._publisher = FramePublisher(session, self._bench, self._channel)
+        self._publisher = FramePublisher(session, self._bench, self._channel, self._congestion)
         self._name_key = f"{ROOT}/{self._bench}/buses/{self._channel}/{self._node:x}"
         try:
             handler = zenoh.handlers.Callback(self._receive, indirect=False)

@@ -41,7 +41,11 @@ TRUTH = Channel("truth", "PlantTruth", 200.0)
 STATUS = Channel("status", "ProcessStatus", 1.0)
 CAN = Channel("can", "CanFrame", 600.0, realtime=True)  # key: can/<bus>/<arbitration id in hex>
 
-CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, EVENT, CYCLE, TRUTH, STATUS, CAN)
+# Lockstep pace alone. Of the priority of what they speak of, so that on a link neither overtakes the other.
+TICK = Channel("tick", "Tick", 200.0, realtime=True, logged=False)
+WATERMARK = Channel("watermark", "Watermark", 1000.0, realtime=True, logged=False)  # key: watermark/<process>
+
+CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, EVENT, CYCLE, TRUTH, STATUS, CAN, TICK, WATERMARK)
 
 
 def key(bench: str, channel: Channel) -> str:
@@ -57,6 +61,11 @@ def can_key(bench: str, bus: str, arbitration_id: int) -> str:
 def alive_key(bench: str, process: str) -> str:
     """Key of a process's liveliness token."""
     return f"{ROOT}/{bench}/alive/{process}"
+
+
+def watermark_key(bench: str, process: str) -> str:
+    """Key on which a process says how far it is at lockstep pace."""
+    return f"{ROOT}/{bench}/{WATERMARK.name}/{process}"
 
 
 def channel_of_key(bench: str, full_key: str) -> Channel | None:

@@ -47,6 +47,16 @@ class ZenohConfig(Table):
         return self.endpoint or default_endpoint(bench)
 
 
+class PaceConfig(Table):
+    """`[pace]`: by which clock the processes go on together."""
+
+    mode: Literal["wall", "lockstep"] = Field("wall", description="wall: the machine's clock; lockstep: tick by tick, all exact")
+    software_latency_us: int = Field(
+        600, ge=0, le=3000, description="lockstep: from a tick to its valve frame, what software takes at wall pace"
+    )
+    timeout_s: float = Field(10.0, gt=0, le=600, description="lockstep: a process that is silent for longer is lost")
+
+
 class HostConfig(Table):
     """`[host]`: what the computer grants the processes of the 5 ms path."""
 

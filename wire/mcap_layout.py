@@ -23,7 +23,7 @@ from typing import Any
 
 from mcap.writer import CompressionType, IndexType, Writer
 
-from softloop.wire.channels import CAN, CHANNELS, ROOT, Channel, key
+from softloop.wire.channels import CAN, CHANNELS, ROOT, WATERMARK, Channel, key
 from softloop.wire.messages import CDR_HEADER, MessageType, message
 
 PROFILE = "ros2"
@@ -75,6 +75,8 @@ def split_topic(topic: str) -> tuple[str, str, tuple[str, int] | None] | None:
     parts = topic.split("/")
     if len(parts) < 4 or parts[0] or parts[1] != ROOT:
         return None
+    if parts[3] == WATERMARK.name:
+        return (parts[2], parts[3], None) if len(parts) == 5 else None
     if parts[3] != CAN.name:
         return (parts[2], parts[3], None) if len(parts) == 4 else None
     number = _hex_number(parts[5]) if len(parts) == 6 else None
@@ -89,13 +91,12 @@ def _hex_number(text: str) -> int | None:
     return number if f"{number:x}" == text else None
 
 
-def logged_channel(bench: str, full_key: str) -> Channel | None:
-    """The channel of a key when it is one that the recorder keeps, else None."""
+def known_channel(bench: str, full_key: str) -> Channel | None:
+    """The channel of a key of this bench, or None."""
     parts = split_topic(topic_of_key(full_key))
     if parts is None or parts[0] != bench:
         return None
-    channel = next((c for c in CHANNELS if c.name == parts[1]), None)
-    return channel if channel is not None and channel.logged else None
+    return next((c for c in CHANNELS if c.name == parts[1]), None)
 
 
 class BadMessage(ValueError):

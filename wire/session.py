@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import threading
 import time
+import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -141,7 +143,7 @@ class Inbox:
         self._items: deque[tuple[str, bytes]] = deque(maxlen=capacity)
         self._ready = threading.Condition()
         self._session, self._key_expr = session, key_expr
-        self.dropped = 0
+        self.dropped = self.received = 0
         self._subscriber = self._subscribe()
 
     def _subscribe(self) -> Any:
@@ -155,6 +157,7 @@ class Inbox:
     def _receive(self, sample: zenoh.Sample) -> None:
         with self._ready:
             self.dropped += len(self._items) == self._items.maxlen
+            self.received += 1
             self._items.append((str(sample.key_expr), sample.payload.to_bytes()))
             self._ready.notify()
 
@@ -177,26 +180,52 @@ class Inbox:
 
 
 class Wire:
-    """One process's end of a bench: publishers, inputs and its sign of life."""
+    """One process's end of a bench: publishers, inputs and its sign of life.
+
+    Attributes:
+        exact: at lockstep pace: who sends waits for who reads, and equal runs give equal bytes.
+        on_put: told of each payload on a channel of the 5 ms path before it is sent.
+    """
 
     def __init__(self, session: zenoh.Session, bench: str, process: str) -> None:
         self.session = session
         self.bench = bench
         self.process = process
+        self.exact = False
+        self.on_put: Callable[[bytes], None] | None = None
         self._token: Any = None
 
     def publisher(self, channel: Channel) -> Callable[[bytes], None]:
-        """A function that publishes a payload on a channel. It never waits: what cannot be sent is dropped."""
+        """A function that publishes a payload on a channel. At wall pace it never waits: what cannot be sent is dropped."""
         publisher = self.declare_publisher(key(self.bench, channel), realtime=channel.realtime)
         put: Callable[[bytes], None] = publisher.put
-        return put
+        return self._noted(put) if channel.realtime and self.on_put else put
+
+    def _noted(self, put: Callable[[bytes], None]) -> Callable[[bytes], None]:
+        def put_noted(payload: bytes) -> None:
+            if self.on_put is not None:
+                self.on_put(payload)
+            put(payload)
+
+        return put_noted
+
+    @property
+    def congestion(self) -> zenoh.CongestionControl:
+        """What a publisher does when a reader is slow."""
+        return zenoh.CongestionControl.BLOCK if self.exact else zenoh.CongestionControl.DROP
+
+    def node_on(self, bus: str) -> int:
+        """The number of this process among a CAN bus's senders: random, and at lockstep pace the same in each run; not 0."""
+        if self.exact:
+            return zlib.crc32(f"{self.bench} {self.process} {bus}".encode()) + 1
+        return secrets.randbits(63) + 1
 
     def declare_publisher(self, full_key: str, *, realtime: bool) -> zenoh.Publisher:
         return self.session.declare_publisher(
             full_key,
             encoding="application/cdr",
             priority=zenoh.Priority.REAL_TIME if realtime else zenoh.Priority.DATA,
-            congestion_control=zenoh.CongestionControl.DROP,
+            congestion_control=self.congestion,
             # An express message takes one of the two buffers of its priority for itself: of four put at once two were lost.
             express=False,
         )

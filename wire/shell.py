@@ -19,9 +19,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 
-from softloop.wire.clock import Clock, WallClock
+from softloop.wire.clock import Clock
 from softloop.wire.config import HostConfig, ZenohConfig
 from softloop.wire.errors import EXIT_LOST, EXIT_OK, SoftloopError
+from softloop.wire.pace import Pace
 from softloop.wire.session import Wire, open_wire
 
 _MCL_CURRENT_FUTURE_ONFAULT = 1 | 2 | 4  # sys/mman.h; on fault: lock what is touched, not all that is mapped
@@ -54,16 +55,28 @@ class Context:
     bench: str
     run_dir: Path
     wire: Wire
-    clock: Clock = field(default_factory=WallClock)
+    pace: Pace = field(default_factory=Pace)
     stop: Stop = field(default_factory=Stop)
     realtime: bool = False
+    on_begin: list[Callable[[], None]] = field(default_factory=list)
+
+    @property
+    def clock(self) -> Clock:
+        """The rig clock."""
+        return self.pace.clock
 
     def enter_loop(self) -> None:
-        """Everything is built and warm: keep the collector out and show that this process is alive."""
+        """Everything is built and warm: keep the collector out, show that this process is alive, and begin with the others.
+
+        Nothing is published before: what is to be said first waits in `on_begin`.
+        """
         gc.collect()
         gc.freeze()
         gc.disable()
         self.wire.declare_alive()
+        self.pace.begin()
+        for say_first in self.on_begin:
+            say_first()
 
 
 def say(process: str, text: str) -> None:
@@ -82,6 +95,7 @@ def run_process(
     run_dir: Path,
     lifeline_fd: int | None = None,
     realtime: bool = True,
+    pace_of: Callable[[Wire, Stop], Pace] = lambda wire, stop: Pace(),
 ) -> int:
     """Run a process's body inside the shell; returns its exit code. A fault ends in one line, never a traceback."""
     stop = Stop()
@@ -93,7 +107,9 @@ def run_process(
     try:
         with open_wire(zenoh, bench, process) as wire:
             wire.settle(lambda: bool(stop))
-            body(Context(process, bench, run_dir, wire, stop=stop, realtime=granted))
+            context = Context(process, bench, run_dir, wire, pace_of(wire, stop), stop, granted)
+            body(context)
+            context.pace.finish()
     except SoftloopError as error:
         say(process, str(error))
         return error.exit_code

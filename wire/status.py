@@ -14,7 +14,7 @@ _STARTING, _RUNNING, _STOPPING = (constant("ProcessStatus", f"STATE_{s}") for s 
 
 
 class StatusReporter:
-    """Publishes `ProcessStatus`: once at the start, then once a second from `cycle`, and at `close`.
+    """Publishes `ProcessStatus`: once when the loop is entered, then once a second from `cycle`, and at `close`.
 
     Attributes:
         dropped: what this process had to drop, in total; the process counts it up itself.
@@ -25,11 +25,11 @@ class StatusReporter:
         self.dropped = 0
         self._clock = context.clock
         self._put = context.wire.publisher(STATUS)
-        self._who = {"pid": os.getpid(), "process": source, "realtime": int(context.realtime)}
+        self._who = {"pid": 0 if context.pace.exact else os.getpid(), "process": source, "realtime": int(context.realtime)}
         self._period_ns = round(1e9 / STATUS.rate_hz)
         self._seq = self._cycles = self._skipped = self._late_max_ns = 0
         self._due_ns = self._clock.now_ns() + self._period_ns
-        self._publish(_STARTING)
+        context.on_begin.append(lambda: self._publish(_STARTING))
 
     def cycle(self, late_ns: int = 0, skipped: int = 0) -> None:
         """One turn of the process's loop, `late_ns` behind its time, after `skipped` that were left out."""

@@ -16,7 +16,7 @@ from softloop.wire.mcap_layout import (
     Origin,
     attachments_of,
     git_state,
-    logged_channel,
+    known_channel,
     read_origin,
     split_topic,
 )
@@ -130,10 +130,10 @@ def test_topics(topic, expected):
 
 
 def test_only_the_benchs_own_channels_are_logged():
-    assert logged_channel("b", key("b", COMMAND)) is COMMAND
-    assert logged_channel("b", key("c", COMMAND)) is None
-    assert logged_channel("b", "softloop/b/nothing") is None
-    assert logged_channel("b", can_key("b", "can0", 0x80)) is CAN
+    assert known_channel("b", key("b", COMMAND)) is COMMAND
+    assert known_channel("b", key("c", COMMAND)) is None
+    assert known_channel("b", "softloop/b/nothing") is None
+    assert known_channel("b", can_key("b", "can0", 0x80)) is CAN
 
 
 def test_the_origin_is_read_once_from_both_clocks():
