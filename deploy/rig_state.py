@@ -22,6 +22,7 @@ REASONS = names_of("ValveStatus", "REASON_")
 DRIVERS = names_of("ValveStatus", "DRIVER_")
 PHASES = names_of("CycleRecord", "PHASE_")
 LOADS = {1: "payload", 2: "contact"}
+FAULTS = names_of("Event", "FAULT_")
 _KINDS = names_of("Event", "KIND_")
 
 
@@ -109,6 +110,8 @@ def _event_text(event: Any) -> str:
         return f"phase {PHASES.get(event.code, event.code)}"
     if kind == "load":
         return f"{LOADS.get(event.reason, 'load')} {'came' if event.code else 'left'} ({event.value:g})"
+    if kind == "fault":
+        return f"fault {FAULTS.get(event.reason, event.reason)} {'came' if event.code else 'left'} ({event.value:g})"
     if kind == "driver":
         return f"valve driver {DRIVERS.get(event.code, event.code)}"
     if kind == "bus":

@@ -5,7 +5,7 @@ from __future__ import annotations
 from softloop.devices.config import InclinometerConfig
 from softloop.devices.inclinometer_setup import SerialSource, configure
 from softloop.devices.protocols import wt931
-from softloop.devices.protocols.quantise import counts_to_deg, counts_to_deg_s
+from softloop.devices.protocols.quantise import counts_to_deg, counts_to_deg_s, mounted_deg
 from softloop.wire.channels import INCLINATION
 from softloop.wire.errors import Lost, Unavailable
 from softloop.wire.messages import constant, message
@@ -55,15 +55,19 @@ def _open_patiently(config: InclinometerConfig, context: Context) -> SerialSourc
     return None
 
 
+def sampler_bounds(config: InclinometerConfig) -> wt931.SamplerConfig:
+    """What the bench file says of believable packets."""
+    return wt931.sampler_config(
+        config.rate_hz, config.max_rate_deg_s, config.noise_deg, config.max_acceleration_deg_s2, config.noise_deg_s
+    )
+
+
 class InclinometerLoop:
     """From bytes to samples, over losses of the port."""
 
     def __init__(self, config: InclinometerConfig, context: Context, source: SerialSource | None) -> None:
         self.config, self.context, self.clock, self.source = config, context, context.clock, source
-        bounds = wt931.sampler_config(
-            config.rate_hz, config.max_rate_deg_s, config.noise_deg, config.max_acceleration_deg_s2, config.noise_deg_s
-        )
-        self.sampler = wt931.Sampler(bounds, config.baud)
+        self.sampler = wt931.Sampler(sampler_bounds(config), config.baud)
         self.seq = 0
         self.put = context.wire.publisher(INCLINATION)
         self.status, self.events = StatusReporter(context, _SOURCE), EventReporter(context, _SOURCE)
@@ -115,7 +119,7 @@ class InclinometerLoop:
             stamp_ns=sample.stamp_ns,
             received_ns=sample.received_ns,
             published_ns=self.clock.now_ns(),
-            angle_deg=self.config.direction * counts_to_deg(sample.angle_counts) - self.config.zero_deg,
+            angle_deg=mounted_deg(counts_to_deg(sample.angle_counts), self.config.direction, self.config.zero_deg),
             rate_deg_s=self.config.direction * counts_to_deg_s(sample.rate_counts),
             rejected=self.sampler.rejected,
             status=_OK if sample.kind == wt931.SAMPLE else _RATE_MISSING,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from softloop.devices.config import ANALOG_DLC, PressuresProcess, SensorConfig
 from softloop.devices.protocols import can_frames
+from softloop.devices.protocols.analog import NOTHING, AnalogConfig, AnalogState, analog_step
 from softloop.devices.protocols.quantise import counts_to_kpa
 from softloop.devices.protocols.wire_time import can_frame_ns
 from softloop.wire.can_config import open_port
@@ -50,9 +51,7 @@ class PressuresLoop:
     def __init__(self, config: PressuresProcess, context: Context, port: CanPort) -> None:
         self.config = config.pressures
         self.context, self.clock, self.port = context, context.clock, port
-        self.frame_ns = can_frame_ns(ANALOG_DLC, config.bus.bitrate)
-        self.seq = self.missed = 0
-        self.counter = -1
+        self.bounds, self.state = analog_config(config), AnalogState()
         self.heard_ns, self.silent = context.clock.now_ns(), False
         self.put = context.wire.publisher(PRESSURE)
         self.status, self.events = StatusReporter(context, _SOURCE), EventReporter(context, _SOURCE)
@@ -64,26 +63,22 @@ class PressuresLoop:
             return
         received_ns = self.clock.now_ns()
         inputs = can_frames.decode_analog_inputs(frame.data)
-        if inputs.counter == self.counter:
-            self.status.dropped += 1  # the same frame again
-            return
-        self.missed += (inputs.counter - self.counter - 1) % 256 if self.counter >= 0 else 0
-        self.counter = inputs.counter
-        self.heard_ns = received_ns
         supply_kpa = _pressure(self.config.supply, inputs.supply_counts)
         chamber_kpa = _pressure(self.config.chamber, inputs.chamber_counts)
-        in_range = _in_range(self.config.supply, supply_kpa) and _in_range(self.config.chamber, chamber_kpa)
-        self.seq += 1
+        state = self.state
+        if analog_step(self.bounds, state, inputs.counter, supply_kpa, chamber_kpa, frame.stamp_ns, received_ns) == NOTHING:
+            self.status.dropped += 1  # the same frame again
+            return
+        self.heard_ns = received_ns
         sample = _SAMPLE.make(
-            seq=self.seq,
-            # At the latest its time on the wire ago; earlier when its own stamp says that it has waited for this process.
-            stamp_ns=min(frame.stamp_ns, received_ns - self.frame_ns),
+            seq=state.seq,
+            stamp_ns=state.stamp_ns,
             received_ns=received_ns,
             published_ns=self.clock.now_ns(),
             supply_pressure_kpa=supply_kpa,
             chamber_pressure_kpa=chamber_kpa,
-            missed=self.missed,
-            status=_OK if in_range else _OUT_OF_RANGE,
+            missed=state.missed,
+            status=_OK if state.in_range else _OUT_OF_RANGE,
         )
         self.put(_SAMPLE.pack(sample))
 
@@ -103,5 +98,13 @@ def _pressure(sensor: SensorConfig, counts: int) -> float:
     return counts_to_kpa(counts, sensor.zero_v, sensor.full_v, sensor.span_kpa)
 
 
-def _in_range(sensor: SensorConfig, pressure_kpa: float) -> bool:
-    return -sensor.margin_kpa <= pressure_kpa <= sensor.span_kpa + sensor.margin_kpa
+def analog_config(config: PressuresProcess) -> AnalogConfig:
+    """The bounds of `analog_step` that follow from the bench file."""
+    supply, chamber = config.pressures.supply, config.pressures.chamber
+    return AnalogConfig(
+        can_frame_ns(ANALOG_DLC, config.bus.bitrate),
+        -supply.margin_kpa,
+        supply.span_kpa + supply.margin_kpa,
+        -chamber.margin_kpa,
+        chamber.span_kpa + chamber.margin_kpa,
+    )

@@ -42,11 +42,11 @@ def valve_flows(air: Any, supply_kpa: float, block_kpa: float, area_in_m2: float
 @kernel(types.void(AIR_TYPE, STATE_TYPE, _F8, _F8))
 def static_air_slopes(air: Any, state: Any, charge_ma: float, exhaust_ma: float) -> None:
     """The ideal layer: Eqs. 11 and 16 to 19, isothermal, at a constant supply; writes the chamber's slope."""
-    chamber = state.stage[CHAMBER]
-    supply_pa, chamber_pa = PA_PER_KPA * air.supply_kpa, PA_PER_KPA * chamber
+    chamber, supply_kpa = state.stage[CHAMBER], air.supply_kpa * (1.0 - state.broken.supply_lost)
+    supply_pa, chamber_pa = PA_PER_KPA * supply_kpa, PA_PER_KPA * chamber
     area_in = orifice_area(air.charge, air.k_v1_charge, air.k_v6_charge, charge_ma, supply_pa, chamber_pa)
     area_out = orifice_area(air.exhaust, air.k_v1_exhaust, air.k_v6_exhaust, exhaust_ma, chamber_pa, 0.0)
-    into, out = valve_flows(air, air.supply_kpa, chamber, area_in, area_out)
+    into, out = valve_flows(air, supply_kpa, chamber, area_in, area_out + state.broken.burst_m2)
     state.slope[CHAMBER] = GAS_CONSTANT * air.wall_k / (PA_PER_KPA * air.volume_m3) * (into - out)
 
 
@@ -90,13 +90,14 @@ def rig_air_slopes(air: Any, state: Any, charge_ma: float, exhaust_ma: float) ->
     """The rig layer: writes the slopes of spools, supply, tube, chamber and gas temperature."""
     x, slope = state.stage, state.slope
     supply, block = x[SUPPLY], x[TUBE]
-    into, out = valve_flows(
-        air, supply, block, min(x[AREA_IN], air.charge.area_max_m2), min(x[AREA_OUT], air.exhaust.area_max_m2)
-    )
+    open_out = max(min(x[AREA_OUT], air.exhaust.area_max_m2), 0.0) + state.broken.burst_m2
+    into, out = valve_flows(air, supply, block, min(x[AREA_IN], air.charge.area_max_m2), open_out)
     block_pa = PA_PER_KPA * block + ATMOSPHERE_PA
     chamber_pa = PA_PER_KPA * x[CHAMBER] + ATMOSPHERE_PA
     line = air.tube_kg_s_pa2 * (block_pa - chamber_pa) * (block_pa + chamber_pa)
-    slope[SUPPLY] = (air.supply_kpa - air.supply_droop_kpa_s_kg * into - supply) * air.supply_rate
+    slope[SUPPLY] = (
+        air.supply_kpa * (1.0 - state.broken.supply_lost) - air.supply_droop_kpa_s_kg * into - supply
+    ) * air.supply_rate
     slope[TUBE] = GAS_CONSTANT * air.wall_k / (PA_PER_KPA * air.tube_volume_m3) * (into - out - line)
     _chamber_slopes(air, state, chamber_pa, line)
     supply_pa, block_gauge_pa = PA_PER_KPA * supply, PA_PER_KPA * block

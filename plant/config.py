@@ -44,6 +44,33 @@ class LoadConfig(Table):
         return self
 
 
+class FaultConfig(Table):
+    """Something that breaks, and perhaps is whole again. Times count from the plant's start."""
+
+    kind: Literal[
+        "chamber_bias", "chamber_stuck", "analog_silent", "angle_bias", "rate_bias", "angle_stuck", "inclinometer_silent", "noise",
+        "commands_lost", "driver_silent", "supply_loss", "hose_burst", "charge_stuck", "exhaust_stuck", "power_loss",
+    ] = Field(description="what breaks; see docs/faults.md")  # fmt: skip
+    on_s: float = Field(ge=0, description="when it breaks")
+    off_s: float = Field(1e9, gt=0, description="default: it stays broken")
+    size: float = Field(
+        0.0, description="bias: kPa, deg, deg/s; noise: times the sensors' own; supply_loss: part; hose_burst: mm2"
+    )
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> FaultConfig:
+        sized = ("chamber_bias", "angle_bias", "rate_bias", "noise", "supply_loss", "hose_burst")
+        if not self.on_s < self.off_s:
+            raise ValueError(f"on_s must be before off_s, got {self.on_s} and {self.off_s}")
+        if (self.kind in sized) != (self.size != 0.0):
+            raise ValueError(f"kind '{self.kind}' {'needs a' if self.kind in sized else 'has no'} size")
+        if (self.kind in ("noise", "supply_loss", "hose_burst") and self.size < 0) or (
+            self.kind == "supply_loss" and self.size > 1
+        ):
+            raise ValueError(f"size of '{self.kind}' is out of range, got {self.size}")
+        return self
+
+
 class PlantConfig(Table):
     """`[plant]`: which rig is simulated, and on which wires."""
 
@@ -73,6 +100,8 @@ class PlantConfig(Table):
     measurement_delay_ms: float = Field(0.0, ge=0, le=1000, description="added to the wires from the sensors and the driver")
 
     loads: tuple[LoadConfig, ...] = Field((), max_length=16, description="payloads and contacts, each a [[plant.loads]]")
+    faults: tuple[FaultConfig, ...] = Field((), max_length=16, description="what breaks and when, each a [[plant.faults]]")
+    dump_valve: bool = Field(False, description="a normally-open valve that vents the chamber when the driver has no power")
 
     @model_validator(mode="after")
     def _known_device_settings(self) -> PlantConfig:

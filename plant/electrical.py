@@ -3,7 +3,7 @@
 `run_until` lets everything up to a time happen, in time order. The physics is brought forward only from one happening to the
 next, so that its steps, and with them every bit, depend on what happens and not on when the caller looks.
 
-Where several happen at the same instant, the order is: valve frame, driver's watchdog, load, driver's status frame, analogue
+Where several happen at the same instant, the order is: valve frame, driver's watchdog, load, fault, driver's status frame, analogue
 module, inclinometer, truth.
 """
 
@@ -16,6 +16,7 @@ from numba import types
 
 from softloop.devices.protocols.quantise_kernels import counts_to_current, current_to_counts, deg_to_counts, value_to_int16
 from softloop.dynamics.noise import gaussian
+from softloop.plant.faults import change_faults
 from softloop.plant.loads import change_loads
 from softloop.plant.physics import advance, settle_inputs
 from softloop.plant.records import (
@@ -26,6 +27,7 @@ from softloop.plant.records import (
     EVENT_INCLINOMETER,
     EVENT_TRUTH,
     EVENTS_TYPE,
+    MAX_FAULTS,
     MAX_LOADS,
     PLANT_TYPE,
     QUEUE,
@@ -42,7 +44,7 @@ _VOID = types.void
 DRIVER_OK = constant("ValveStatus", "DRIVER_OK")
 DRIVER_WATCHDOG = constant("ValveStatus", "DRIVER_WATCHDOG")
 NEVER_NS = np.iinfo(np.int64).max
-SAMPLE_GUARD = MAX_LOADS + 1  # free places in `events` that one happening may need
+SAMPLE_GUARD = max(MAX_LOADS, MAX_FAULTS) + 1  # free places in `events` that one happening may need
 
 # Noise sources; see `dynamics.noise`.
 _NOISE_SUPPLY, _NOISE_CHAMBER, _NOISE_ANGLE, _NOISE_RATE, _NOISE_COIL_IN, _NOISE_COIL_OUT = 1, 2, 3, 4, 5, 6
@@ -91,7 +93,7 @@ def _frame_due_ns(state: Any) -> int:
 @kernel(_I8(PLANT_TYPE, STATE_TYPE))
 def next_event_ns(params: Any, state: Any) -> int:
     """Rig clock of the next happening inside the rig."""
-    due = min(_frame_due_ns(state), state.driver.watchdog_at_ns, state.next_load_ns)
+    due = min(_frame_due_ns(state), state.driver.watchdog_at_ns, state.next_load_ns, state.next_fault_ns)
     return min(due, state.next_echo_ns, state.next_analog_ns, state.next_inclinometer_ns, state.next_truth_ns)
 
 
@@ -114,9 +116,13 @@ def _drive(params: Any, state: Any, charge_ma: float, exhaust_ma: float) -> None
 
 @kernel(_I8(PLANT_TYPE, STATE_TYPE, EVENTS_TYPE, _I8))
 def _apply_frame(params: Any, state: Any, events: np.ndarray, n: int) -> int:
-    """The driver takes the oldest frame of its queue."""
+    """The driver takes the oldest frame of its queue, when that reaches it."""
     driver = state.driver
     frame = driver.queue[driver.head]
+    if state.broken.commands_lost or state.broken.power_lost:
+        driver.head = (driver.head + 1) % QUEUE
+        driver.waiting -= 1
+        return n
     _drive(params, state, counts_to_current(frame.charge), counts_to_current(frame.exhaust))
     driver.seq = frame.seq
     driver.accepted += 1
@@ -133,7 +139,10 @@ def _apply_frame(params: Any, state: Any, events: np.ndarray, n: int) -> int:
 
 @kernel(_I8(PLANT_TYPE, STATE_TYPE, EVENTS_TYPE, _I8))
 def _watchdog(params: Any, state: Any, events: np.ndarray, n: int) -> int:
-    """No good frame in time: the driver vents by itself."""
+    """No good frame in time: the driver vents by itself, unless it has no power."""
+    if state.broken.power_lost:
+        state.driver.watchdog_at_ns = NEVER_NS
+        return n
     _drive(params, state, 0.0, params.electrical.vent_ma)
     state.driver.state = DRIVER_WATCHDOG
     state.driver.watchdog_at_ns = NEVER_NS
@@ -146,6 +155,10 @@ def _watchdog(params: Any, state: Any, events: np.ndarray, n: int) -> int:
 def _echo(params: Any, state: Any, events: np.ndarray, n: int) -> int:
     """The driver's status frame with the coil currents it measures."""
     electrical = params.electrical
+    if state.broken.driver_silent or state.broken.power_lost:
+        state.echoes += 1
+        state.next_echo_ns += electrical.echo_period_ns
+        return n
     n = _write(
         events, n, EVENT_DRIVER_FRAME, state.t_ns, state.t_ns + electrical.driver_frame_ns + electrical.measurement_delay_ns
     )
@@ -172,16 +185,21 @@ def _adc(sensor: Any, pressure_kpa: float, unit_noise: float) -> int:
 @kernel(_I8(PLANT_TYPE, STATE_TYPE, EVENTS_TYPE, _I8))
 def _sample_pressures(params: Any, state: Any, events: np.ndarray, n: int) -> int:
     """The analogue module's frame."""
-    electrical, count = params.electrical, state.analog_samples
+    electrical, count, broken = params.electrical, state.analog_samples, state.broken
+    state.analog_samples += 1
+    state.next_analog_ns += electrical.analog_period_ns
+    noise = 1.0 + broken.noise
+    supply = _adc(electrical.supply, state.sensed_supply_kpa, noise * gaussian(params.seed, _NOISE_SUPPLY, count))
+    sensed_kpa = state.sensed_chamber_kpa + broken.chamber_bias_kpa
+    if not broken.chamber_stuck:
+        state.held_chamber = _adc(electrical.chamber, sensed_kpa, noise * gaussian(params.seed, _NOISE_CHAMBER, count))
+    if broken.analog_silent:
+        return n
     n = _write(
         events, n, EVENT_ANALOG_FRAME, state.t_ns, state.t_ns + electrical.analog_frame_ns + electrical.measurement_delay_ns
     )
     event = events[n - 1]
-    event.raw[0] = _adc(electrical.supply, state.sensed_supply_kpa, gaussian(params.seed, _NOISE_SUPPLY, count))
-    event.raw[1] = _adc(electrical.chamber, state.sensed_chamber_kpa, gaussian(params.seed, _NOISE_CHAMBER, count))
-    event.raw[2] = count % 256
-    state.analog_samples += 1
-    state.next_analog_ns += electrical.analog_period_ns
+    event.raw[0], event.raw[1], event.raw[2] = supply, state.held_chamber, count % 256
     return n
 
 
@@ -194,17 +212,23 @@ def inclinometer_period_ns(electrical: Any, nominal_ns: int) -> int:
 @kernel(_I8(PLANT_TYPE, STATE_TYPE, EVENTS_TYPE, _I8))
 def _sample_inclinometer(params: Any, state: Any, events: np.ndarray, n: int) -> int:
     """The inclinometer's packets of one sample."""
-    electrical, device, count = params.electrical, state.inclinometer, state.inclinometer_samples
-    n = _write(events, n, EVENT_INCLINOMETER, state.t_ns, state.t_ns + device.wire_ns + electrical.measurement_delay_ns)
-    rate = electrical.gyro_scale * device.rate_deg_s + electrical.gyro_bias_deg_s
-    rate += electrical.rate_noise_deg_s * gaussian(params.seed, _NOISE_RATE, count)
-    angle = device.angle_deg + electrical.angle_noise_deg * gaussian(params.seed, _NOISE_ANGLE, count)
-    event = events[n - 1]
-    event.raw[0] = value_to_int16(rate, _GYRO_FULL_DEG_S)
-    event.raw[1] = deg_to_counts(angle)
-    event.raw[2] = device.content
+    electrical, device, count, broken = params.electrical, state.inclinometer, state.inclinometer_samples, state.broken
     state.inclinometer_samples += 1
     state.next_inclinometer_ns += inclinometer_period_ns(electrical, device.period_ns)
+    rate_noise, angle_noise = (
+        (1.0 + broken.noise) * electrical.rate_noise_deg_s,
+        (1.0 + broken.noise) * electrical.angle_noise_deg,
+    )
+    rate = electrical.gyro_scale * device.rate_deg_s + electrical.gyro_bias_deg_s + broken.rate_bias_deg_s
+    rate += rate_noise * gaussian(params.seed, _NOISE_RATE, count)
+    angle = device.angle_deg + broken.angle_bias_deg + angle_noise * gaussian(params.seed, _NOISE_ANGLE, count)
+    if not broken.angle_stuck:
+        state.held_rate, state.held_angle = value_to_int16(rate, _GYRO_FULL_DEG_S), deg_to_counts(angle)
+    if broken.inclinometer_silent:
+        return n
+    n = _write(events, n, EVENT_INCLINOMETER, state.t_ns, state.t_ns + device.wire_ns + electrical.measurement_delay_ns)
+    event = events[n - 1]
+    event.raw[0], event.raw[1], event.raw[2] = state.held_rate, state.held_angle, device.content
     return n
 
 
@@ -217,6 +241,13 @@ def _happen(params: Any, state: Any, events: np.ndarray, n: int, due_ns: int) ->
         return _watchdog(params, state, events, n)
     if due_ns == state.next_load_ns:
         return change_loads(params, state, events, n)
+    if due_ns == state.next_fault_ns:
+        n = change_faults(params, state, events, n)
+        if state.broken.power_lost:  # the coils let go; a driver that comes back starts in its watchdog's vent
+            _drive(params, state, 0.0, 0.0)
+            state.driver.state = DRIVER_WATCHDOG
+            state.driver.watchdog_at_ns = NEVER_NS
+        return n
     if due_ns == state.next_echo_ns:
         return _echo(params, state, events, n)
     if due_ns == state.next_analog_ns:

@@ -41,6 +41,14 @@ def play(current_ma: float, held_ma: float, half_width_ma: float) -> float:
     return max(current_ma - half_width_ma, min(current_ma + half_width_ma, held_ma))
 
 
+@kernel(types.UniTuple(_F8, 2)(PLANT_TYPE, STATE_TYPE))
+def play_widths(params: Any, state: Any) -> tuple[float, float]:
+    """Half widths of the two valves' loops, mA; a valve that is stuck feels no current any more."""
+    charge = inf if state.broken.charge_stuck else params.air.play_charge_ma
+    exhaust = inf if state.broken.exhaust_stuck else params.air.play_exhaust_ma
+    return charge, exhaust
+
+
 @kernel(types.void(PLANT_TYPE, STATE_TYPE, _F8, _F8))
 def slopes(params: Any, state: Any, charge_ma: float, exhaust_ma: float) -> None:
     """The right-hand side: `state.slope` from `state.stage` and the currents that the spools feel."""
@@ -72,11 +80,12 @@ def _left(transient_ma: float) -> float:
 @kernel(types.void(PLANT_TYPE, STATE_TYPE, _F8, _F8))
 def _try(params: Any, state: Any, step_s: float, half_decay: float) -> None:
     """One RK4 step into `state.next`; nothing else changes. `half_decay`: what is left of a coil's transient after half of it."""
-    air, decay = params.air, half_decay * half_decay
+    decay = half_decay * half_decay
     charge, exhaust = state.command_charge_ma, state.command_exhaust_ma
     charge_off, exhaust_off = state.coil_charge_ma - charge, state.coil_exhaust_ma - exhaust
-    middle_in = play(charge + charge_off * half_decay, state.play_charge_ma, air.play_charge_ma)
-    middle_out = play(exhaust + exhaust_off * half_decay, state.play_exhaust_ma, air.play_exhaust_ma)
+    width_in, width_out = play_widths(params, state)
+    middle_in = play(charge + charge_off * half_decay, state.play_charge_ma, width_in)
+    middle_out = play(exhaust + exhaust_off * half_decay, state.play_exhaust_ma, width_out)
     for i in range(params.n_states):
         state.stage[i] = state.x[i]
         state.next[i] = state.x[i]
@@ -87,8 +96,8 @@ def _try(params: Any, state: Any, step_s: float, half_decay: float) -> None:
     _next_stage(params, state, step_s / 3.0, 0.5 * step_s)
     slopes(params, state, middle_in, middle_out)
     _next_stage(params, state, step_s / 3.0, step_s)
-    end_in = play(charge + charge_off * decay, state.play_charge_ma, air.play_charge_ma)
-    end_out = play(exhaust + exhaust_off * decay, state.play_exhaust_ma, air.play_exhaust_ma)
+    end_in = play(charge + charge_off * decay, state.play_charge_ma, width_in)
+    end_out = play(exhaust + exhaust_off * decay, state.play_exhaust_ma, width_out)
     slopes(params, state, end_in, end_out)
     for i in range(params.n_states):
         state.next[i] += step_s / 6.0 * state.slope[i]
@@ -102,8 +111,9 @@ def _accept(params: Any, state: Any, half_decay: float) -> None:
     decay = half_decay * half_decay
     state.coil_charge_ma = state.command_charge_ma + _left(state.coil_charge_ma - state.command_charge_ma) * decay
     state.coil_exhaust_ma = state.command_exhaust_ma + _left(state.coil_exhaust_ma - state.command_exhaust_ma) * decay
-    state.play_charge_ma = play(state.coil_charge_ma, state.play_charge_ma, params.air.play_charge_ma)
-    state.play_exhaust_ma = play(state.coil_exhaust_ma, state.play_exhaust_ma, params.air.play_exhaust_ma)
+    width_in, width_out = play_widths(params, state)
+    state.play_charge_ma = play(state.coil_charge_ma, state.play_charge_ma, width_in)
+    state.play_exhaust_ma = play(state.coil_exhaust_ma, state.play_exhaust_ma, width_out)
     if params.mechanics.memory:
         advance_memory(params.mechanics, state.memory, state.x[ANGLE])
     state.steps += 1
@@ -141,8 +151,9 @@ def settle_inputs(params: Any, state: Any) -> None:
     """After a command: without a lag of the coil the current, and what the spool feels, jump with it."""
     if params.air.coil_lag_s == 0.0:
         state.coil_charge_ma, state.coil_exhaust_ma = state.command_charge_ma, state.command_exhaust_ma
-    state.play_charge_ma = play(state.coil_charge_ma, state.play_charge_ma, params.air.play_charge_ma)
-    state.play_exhaust_ma = play(state.coil_exhaust_ma, state.play_exhaust_ma, params.air.play_exhaust_ma)
+    width_in, width_out = play_widths(params, state)
+    state.play_charge_ma = play(state.coil_charge_ma, state.play_charge_ma, width_in)
+    state.play_exhaust_ma = play(state.coil_exhaust_ma, state.play_exhaust_ma, width_out)
 
 
 @kernel(_F8(_F8, _F8, _F8, _F8, _F8))
@@ -195,11 +206,10 @@ def advance(params: Any, state: Any, to_ns: int) -> None:
     if to_ns <= state.t_ns:
         return
     left_s, air = _NS * (to_ns - state.t_ns), params.air
+    width_in, width_out = play_widths(params, state)
     for _ in range(2 if params.rig else 0):
-        slip_in = slip_s(state.coil_charge_ma, state.command_charge_ma, state.play_charge_ma, air.play_charge_ma, air.coil_lag_s)
-        slip_out = slip_s(
-            state.coil_exhaust_ma, state.command_exhaust_ma, state.play_exhaust_ma, air.play_exhaust_ma, air.coil_lag_s
-        )
+        slip_in = slip_s(state.coil_charge_ma, state.command_charge_ma, state.play_charge_ma, width_in, air.coil_lag_s)
+        slip_out = slip_s(state.coil_exhaust_ma, state.command_exhaust_ma, state.play_exhaust_ma, width_out, air.coil_lag_s)
         piece_s = min(slip_in, slip_out)
         if piece_s < left_s - _SHORTEST_S and piece_s > _SHORTEST_S:
             _advance_smooth(params, state, piece_s)

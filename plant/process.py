@@ -12,7 +12,7 @@ import numpy as np
 
 from softloop.plant.config import PlantProcess
 from softloop.plant.electrical import next_event_ns, run_until
-from softloop.plant.records import EVENT, EVENT_DRIVER, EVENT_LOAD, EVENT_TRUTH
+from softloop.plant.records import EVENT, EVENT_DRIVER, EVENT_FAULT, EVENT_LOAD, EVENT_TRUTH
 from softloop.plant.setup import PERIOD_NS, WireTimes, new_device, new_state, plant_record
 from softloop.plant.wires import CanSide, Outbox, SerialSide
 from softloop.wire.channels import TRUTH
@@ -22,6 +22,7 @@ from softloop.wire.status import EventReporter, StatusReporter
 
 SOURCE = constant("Event", "SOURCE_PLANT")
 KIND_LOAD = constant("Event", "KIND_LOAD")
+KIND_FAULT = constant("Event", "KIND_FAULT")
 KIND_DRIVER = constant("Event", "KIND_DRIVER")
 LATE_NS = 2_000_000  # a plant later than this makes a run no valid evidence
 _EVENTS = 256
@@ -89,6 +90,8 @@ class Plant:
             self._serial.listen(self._params, self._state, self._outbox)
         elif kind == EVENT_LOAD:
             self._reporter.say(KIND_LOAD, sample_ns, code=raw[0], reason=raw[1], value=value)
+        elif kind == EVENT_FAULT:
+            self._reporter.say(KIND_FAULT, sample_ns, code=raw[0], reason=raw[1], value=value)
         elif kind == EVENT_DRIVER:
             self._reporter.say(KIND_DRIVER, sample_ns, code=raw[0])
         else:

@@ -15,9 +15,11 @@ N_IDEAL = 3
 N_VALVES = 2
 N_STOPS = 4  # stop operators of the actuator's hysteresis
 MAX_LOADS = 16
+MAX_FAULTS = 16
 QUEUE = 256  # valve frames under way: 1.28 s of them at 200 Hz
 
 EVENT_DRIVER_FRAME, EVENT_ANALOG_FRAME, EVENT_INCLINOMETER, EVENT_TRUTH, EVENT_LOAD, EVENT_DRIVER = 1, 2, 3, 4, 5, 6
+EVENT_FAULT = 7
 LOAD_PAYLOAD, LOAD_CONTACT = 1, 2
 CONTENT_GYRO, CONTENT_ANGLE = 1, 2
 
@@ -99,6 +101,7 @@ ELECTRICAL = record_dtype(
         ("truth_period_ns", "i8"),
     ]
 )
+FAULT = record_dtype([("kind", "i8"), ("on_ns", "i8"), ("off_ns", "i8"), ("magnitude", "f8")])
 LOAD = record_dtype([("kind", "i8"), ("on_ns", "i8"), ("off_ns", "i8"), ("magnitude", "f8"), ("angle_deg", "f8")])
 PLANT = record_dtype(
     [
@@ -106,6 +109,8 @@ PLANT = record_dtype(
         ("air", AIR),
         ("electrical", ELECTRICAL),
         ("loads", LOAD, (MAX_LOADS,)),
+        ("faults", FAULT, (MAX_FAULTS,)),
+        ("dump_m2", "f8"),  # opening of the dump valve without power; 0 where there is none
         ("seed", "i8"),
         ("step_ns", "i8"),
         ("n_states", "i8"),
@@ -149,6 +154,26 @@ INCLINOMETER = record_dtype(
         ("rate_deg_s", "f8"),
     ]
 )
+# What is broken now; see `plant.faults`.
+BROKEN = record_dtype(
+    [
+        ("chamber_bias_kpa", "f8"),
+        ("angle_bias_deg", "f8"),
+        ("rate_bias_deg_s", "f8"),
+        ("noise", "f8"),  # times the sensors' own, besides it
+        ("supply_lost", "f8"),  # part of the supply pressure
+        ("burst_m2", "f8"),  # an opening beside the leak
+        ("chamber_stuck", "u1"),
+        ("analog_silent", "u1"),
+        ("angle_stuck", "u1"),
+        ("inclinometer_silent", "u1"),
+        ("commands_lost", "u1"),
+        ("driver_silent", "u1"),
+        ("charge_stuck", "u1"),
+        ("exhaust_stuck", "u1"),
+        ("power_lost", "u1"),
+    ]
+)
 STATE = record_dtype(
     [
         ("start_ns", "i8"),
@@ -181,6 +206,12 @@ STATE = record_dtype(
         ("analog_samples", "i8"),
         ("inclinometer_samples", "i8"),
         ("load_on", "u1", (MAX_LOADS,)),
+        ("next_fault_ns", "i8"),
+        ("fault_on", "u1", (MAX_FAULTS,)),
+        ("broken", BROKEN),
+        ("held_chamber", "i8"),  # the readings that a stuck sensor repeats, counts
+        ("held_angle", "i8"),
+        ("held_rate", "i8"),
         ("truth", message("PlantTruth").dtype),
     ]
 )

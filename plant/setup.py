@@ -11,6 +11,7 @@ from softloop.devices.protocols.wire_time import can_frame_ns
 from softloop.dynamics.parameters import Parameters, load_parameters, shipped
 from softloop.plant.config import LoadConfig, PlantConfig, SensorConfig
 from softloop.plant.electrical import DRIVER_WATCHDOG, NEVER_NS, inclinometer_period_ns
+from softloop.plant.faults import FAULTS, plan_faults
 from softloop.plant.inclinometer_device import InclinometerDevice
 from softloop.plant.loads import plan_loads
 from softloop.plant.mismatch import Draws, draw
@@ -31,6 +32,7 @@ from softloop.wire.kernel import new_record
 
 PERIOD_NS = 5_000_000
 DLC = 8
+DUMP_VALVE_M2 = 2e-6  # a small 2/2 valve, about three times the exhaust valve's opening
 _MS = 1_000_000
 _S = 1_000_000_000
 _RISE_PER_LAG = log(9.0)  # 10 to 90 % of a first-order lag
@@ -63,6 +65,10 @@ def plant_record(config: PlantConfig, wires: WireTimes | None = None) -> Any:
     electrical.current_max_ma = parameters.pneumatics.current_max_ma
     for place, load in zip(plant.loads, config.loads, strict=False):
         _fill_load(place, load)
+    for place, fault in zip(plant.faults, config.faults, strict=False):
+        place.kind, place.magnitude = FAULTS[fault.kind], fault.size
+        place.on_ns, place.off_ns = round(fault.on_s * _S), round(fault.off_s * _S)
+    plant.dump_m2 = DUMP_VALVE_M2 if config.dump_valve else 0.0
     return plant
 
 
@@ -129,6 +135,7 @@ def new_state(params: Any, device: InclinometerDevice, start_ns: int) -> Any:
     state.next_truth_ns = start_ns
     state.t_ns -= 1  # so that a load at second 0 is a change
     plan_loads(params, state)
+    plan_faults(params, state)
     state.t_ns = start_ns
     configure_inclinometer(params, state, device)
     state.next_inclinometer_ns = start_ns + electrical.inclinometer_phase_ns

@@ -55,6 +55,11 @@ def counts_to_deg_s(counts: int) -> float:
     return counts / INT16_FULL * RATE_FULL_DEG_S
 
 
+def mounted_deg(angle_deg: float, direction: int, zero_deg: float) -> float:
+    """The bending angle from the device's own: `direction` 1 or -1 as it is mounted, `zero_deg` its angle where bending is 0."""
+    return direction * angle_deg - zero_deg
+
+
 def deg_to_counts(angle_deg: float) -> int:
     """A finite angle -> the int16 that a WT931 sends: rounded half to even and wrapped into -180..180 degrees."""
     counts = round(angle_deg / ANGLE_FULL_DEG * INT16_FULL)
