@@ -48,14 +48,12 @@ class FaultConfig(Table):
     """Something that breaks, and perhaps is whole again. Times count from the plant's start."""
 
     kind: Literal[
-        "chamber_bias", "chamber_stuck", "analog_silent", "angle_bias", "rate_bias", "angle_stuck", "inclinometer_silent", "noise",
-        "commands_lost", "driver_silent", "supply_loss", "hose_burst", "charge_stuck", "exhaust_stuck", "power_loss",
+        "chamber_bias", "chamber_stuck", "analog_silent", "angle_bias", "rate_bias", "angle_stuck", "inclinometer_silent",
+        "noise", "commands_lost", "driver_silent", "supply_loss", "hose_burst", "charge_stuck", "exhaust_stuck", "power_loss",
     ] = Field(description="what breaks; see docs/faults.md")  # fmt: skip
     on_s: float = Field(ge=0, description="when it breaks")
     off_s: float = Field(1e9, gt=0, description="default: it stays broken")
-    size: float = Field(
-        0.0, description="bias: kPa, deg, deg/s; noise: times the sensors' own; supply_loss: part; hose_burst: mm2"
-    )
+    size: float = Field(0.0, description="bias: kPa, deg, deg/s; noise: times the own; supply_loss: part; hose_burst: mm2")
 
     @model_validator(mode="after")
     def _makes_sense(self) -> FaultConfig:

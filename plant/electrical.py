@@ -3,8 +3,8 @@
 `run_until` lets everything up to a time happen, in time order. The physics is brought forward only from one happening to the
 next, so that its steps, and with them every bit, depend on what happens and not on when the caller looks.
 
-Where several happen at the same instant, the order is: valve frame, driver's watchdog, load, fault, driver's status frame, analogue
-module, inclinometer, truth.
+Where several happen at the same instant, the order is: valve frame, driver's watchdog, load, fault, driver's status frame,
+analogue module, inclinometer, truth.
 """
 
 from __future__ import annotations
@@ -220,8 +220,10 @@ def _sample_inclinometer(params: Any, state: Any, events: np.ndarray, n: int) ->
         (1.0 + broken.noise) * electrical.angle_noise_deg,
     )
     rate = electrical.gyro_scale * device.rate_deg_s + electrical.gyro_bias_deg_s + broken.rate_bias_deg_s
-    rate += rate_noise * gaussian(params.seed, _NOISE_RATE, count)
-    angle = device.angle_deg + broken.angle_bias_deg + angle_noise * gaussian(params.seed, _NOISE_ANGLE, count)
+    rate += noise * electrical.rate_noise_deg_s * gaussian(params.seed, _NOISE_RATE, count)
+    angle = (
+        device.angle_deg + broken.angle_bias_deg + noise * electrical.angle_noise_deg * gaussian(params.seed, _NOISE_ANGLE, count)
+    )
     if not broken.angle_stuck:
         state.held_rate, state.held_angle = value_to_int16(rate, _GYRO_FULL_DEG_S), deg_to_counts(angle)
     if broken.inclinometer_silent:

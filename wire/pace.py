@@ -59,8 +59,9 @@ class Pace:
 
     exact = False
 
-    def __init__(self) -> None:
-        self.clock: Clock = WallClock()
+    def __init__(self, clock: Clock | None = None) -> None:
+        """`clock`: the machine's monotonic one unless given."""
+        self.clock: Clock = clock or WallClock()
 
     def begin(self) -> None:
         """All inputs are declared: wait until everybody's are."""

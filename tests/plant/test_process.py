@@ -26,8 +26,8 @@ from softloop.plant.process import run
 from softloop.plant.wires import Outbox
 from softloop.wire.can_config import CanConfig, open_port
 from softloop.wire.channels import EVENT, STATUS, TRUTH
-from softloop.wire.clock import WallClock
 from softloop.wire.messages import constant, message
+from softloop.wire.pace import Pace
 from softloop.wire.serial_urls import open_serial
 from softloop.wire.session import open_wire
 from softloop.wire.shell import Context
@@ -95,7 +95,7 @@ def running(clock=None, **plant):
         open_wire(zenoh, "test", "plant") as wire,
         open_wire(zenoh, "test", "other") as other,
     ):
-        context = Context("plant", "test", folder, wire, clock=clock or WallClock())
+        context = Context("plant", "test", folder, wire, Pace(clock))
         context.enter_loop = wire.declare_alive  # the test's process keeps its garbage collector
         config = plant_process(PlantConfig.model_validate(plant), BUSES)
         can = open_port(BUSES["can0"], "can0", other, context.clock, (VALVE_STATUS_ID, ANALOG_INPUTS_ID))
