@@ -215,15 +215,11 @@ def _sample_inclinometer(params: Any, state: Any, events: np.ndarray, n: int) ->
     electrical, device, count, broken = params.electrical, state.inclinometer, state.inclinometer_samples, state.broken
     state.inclinometer_samples += 1
     state.next_inclinometer_ns += inclinometer_period_ns(electrical, device.period_ns)
-    rate_noise, angle_noise = (
-        (1.0 + broken.noise) * electrical.rate_noise_deg_s,
-        (1.0 + broken.noise) * electrical.angle_noise_deg,
-    )
-    rate = electrical.gyro_scale * device.rate_deg_s + electrical.gyro_bias_deg_s + broken.rate_bias_deg_s
-    rate += noise * electrical.rate_noise_deg_s * gaussian(params.seed, _NOISE_RATE, count)
-    angle = (
-        device.angle_deg + broken.angle_bias_deg + noise * electrical.angle_noise_deg * gaussian(params.seed, _NOISE_ANGLE, count)
-    )
+    noise = 1.0 + broken.noise
+    rate_noise = noise * electrical.rate_noise_deg_s * gaussian(params.seed, _NOISE_RATE, count)
+    angle_noise = noise * electrical.angle_noise_deg * gaussian(params.seed, _NOISE_ANGLE, count)
+    rate = electrical.gyro_scale * device.rate_deg_s + electrical.gyro_bias_deg_s + broken.rate_bias_deg_s + rate_noise
+    angle = device.angle_deg + broken.angle_bias_deg + angle_noise
     if not broken.angle_stuck:
         state.held_rate, state.held_angle = value_to_int16(rate, _GYRO_FULL_DEG_S), deg_to_counts(angle)
     if broken.inclinometer_silent:

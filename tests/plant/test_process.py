@@ -26,6 +26,7 @@ from softloop.plant.process import run
 from softloop.plant.wires import Outbox
 from softloop.wire.can_config import CanConfig, open_port
 from softloop.wire.channels import EVENT, STATUS, TRUTH
+from softloop.wire.clock import WallClock
 from softloop.wire.messages import constant, message
 from softloop.wire.pace import Pace
 from softloop.wire.serial_urls import open_serial
