@@ -8,9 +8,17 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
+from softloop.devices.protocols.analog import AnalogConfig
 from softloop.devices.protocols.quantise import COUNTS_MAX, MA_PER_COUNT
 from softloop.devices.protocols.wire_time import can_frame_ns, serial_ns
-from softloop.devices.protocols.wt931 import BANDWIDTH_CODES, BAUD_CODES, RATE_CODES, SAMPLE_BYTES
+from softloop.devices.protocols.wt931 import (
+    BANDWIDTH_CODES,
+    BAUD_CODES,
+    RATE_CODES,
+    SAMPLE_BYTES,
+    SamplerConfig,
+    sampler_config,
+)
 from softloop.wire.benchfile import Table
 from softloop.wire.can_config import CanConfig
 from softloop.wire.channels import COMMAND
@@ -164,6 +172,25 @@ def valves_process(
 def pressures_process(pressures: PressuresConfig, buses: Mapping[str, CanConfig]) -> PressuresProcess:
     """The config of `pressures` with its bus. Raises BadConfig on an unknown bus."""
     return PressuresProcess(pressures, _bus(buses, "pressures", pressures.can))
+
+
+def analog_config(config: PressuresProcess) -> AnalogConfig:
+    """The bounds of `analog_step` that follow from the bench file."""
+    supply, chamber = config.pressures.supply, config.pressures.chamber
+    return AnalogConfig(
+        can_frame_ns(ANALOG_DLC, config.bus.bitrate),
+        -supply.margin_kpa,
+        supply.span_kpa + supply.margin_kpa,
+        -chamber.margin_kpa,
+        chamber.span_kpa + chamber.margin_kpa,
+    )
+
+
+def sampler_bounds(config: InclinometerConfig) -> SamplerConfig:
+    """What the bench file says of believable packets."""
+    return sampler_config(
+        config.rate_hz, config.max_rate_deg_s, config.noise_deg, config.max_acceleration_deg_s2, config.noise_deg_s
+    )
 
 
 def _bus(buses: Mapping[str, CanConfig], table: str, name: str) -> CanConfig:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from softloop.devices.config import InclinometerConfig
+from softloop.devices.config import InclinometerConfig, sampler_bounds
 from softloop.devices.inclinometer_setup import SerialSource, configure
 from softloop.devices.protocols import wt931
 from softloop.devices.protocols.quantise import counts_to_deg, counts_to_deg_s, mounted_deg
@@ -53,13 +53,6 @@ def _open_patiently(config: InclinometerConfig, context: Context) -> SerialSourc
                 raise
         context.stop.wait(_REOPEN_S)
     return None
-
-
-def sampler_bounds(config: InclinometerConfig) -> wt931.SamplerConfig:
-    """What the bench file says of believable packets."""
-    return wt931.sampler_config(
-        config.rate_hz, config.max_rate_deg_s, config.noise_deg, config.max_acceleration_deg_s2, config.noise_deg_s
-    )
 
 
 class InclinometerLoop:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from softloop.devices.config import ANALOG_DLC, PressuresProcess, SensorConfig
+from softloop.devices.config import ANALOG_DLC, PressuresProcess, SensorConfig, analog_config
 from softloop.devices.protocols import can_frames
-from softloop.devices.protocols.analog import NOTHING, AnalogConfig, AnalogState, analog_step
+from softloop.devices.protocols.analog import NOTHING, AnalogState, analog_step
 from softloop.devices.protocols.quantise import counts_to_kpa
-from softloop.devices.protocols.wire_time import can_frame_ns
 from softloop.wire.can_config import open_port
 from softloop.wire.can_frame import CanFrame
 from softloop.wire.can_port import CanPort
@@ -96,15 +95,3 @@ class PressuresLoop:
 
 def _pressure(sensor: SensorConfig, counts: int) -> float:
     return counts_to_kpa(counts, sensor.zero_v, sensor.full_v, sensor.span_kpa)
-
-
-def analog_config(config: PressuresProcess) -> AnalogConfig:
-    """The bounds of `analog_step` that follow from the bench file."""
-    supply, chamber = config.pressures.supply, config.pressures.chamber
-    return AnalogConfig(
-        can_frame_ns(ANALOG_DLC, config.bus.bitrate),
-        -supply.margin_kpa,
-        supply.span_kpa + supply.margin_kpa,
-        -chamber.margin_kpa,
-        chamber.span_kpa + chamber.margin_kpa,
-    )

@@ -1,141 +1,185 @@
-"""Plant and controller closed in one compiled loop: the processes' own kernels, without processes and wires.
-
-Samples arrive when their frame or packets end; a command takes effect at its frame's end, `loop_delay_ns` (the software's
-share, from tick to bus) and the frame's time after its tick. The gate is taken as armed from the first tick on.
-"""
+"""Runs in this process: from the tables of a bench file to the records of the closed loop, and what a run leaves."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import types
 from numpy.typing import NDArray
 
 from softloop.controller.config import ControllerConfig
-from softloop.controller.laws.arc import STEP1_TYPE
-from softloop.controller.records import CONFIG_TYPE, CYCLE, CYCLE_TYPE, GAINS_TYPE, GATE_ARMED, INPUTS_TYPE, OUTPUT_PASS
-from softloop.controller.records import STATE_TYPE as CONTROLLER_STATE_TYPE
-from softloop.controller.setup import PERIOD_NS, build
-from softloop.controller.tick import SCRATCH_TYPE, controller_tick
-from softloop.devices.protocols.quantise_kernels import counts_to_deg, counts_to_deg_s, counts_to_kpa, current_to_counts
-from softloop.dynamics.parameters import MODEL_TYPE
+from softloop.controller.records import CYCLE, PHASE_APPROACH, PHASE_DONE, PHASE_TRACK
+from softloop.controller.setup import Controller, build
+from softloop.devices.config import (
+    ANALOG_DLC,
+    InclinometerConfig,
+    PressuresConfig,
+    SensorConfig,
+    ValvesConfig,
+    analog_config,
+    pressures_process,
+    sampler_bounds,
+    valves_process,
+)
+from softloop.devices.gate import GATE_FAULT, gate_config
+from softloop.devices.protocols.analog import ANALOG_CONFIG, AnalogConfig
+from softloop.devices.protocols.wire_time import can_frame_ns, serial_ns
+from softloop.devices.protocols.wt931 import SAMPLE_BYTES, SAMPLER_CONFIG, as_record
+from softloop.offline.loop_kernels import SHUTDOWN_FRAMES, simulate
+from softloop.offline.loop_records import BETWEEN, INCLINATION, LINK, PRESSURE, TRUTH, VALVE_STATUS, no_records
 from softloop.plant.config import PlantConfig
-from softloop.plant.electrical import accept_command, run_until
-from softloop.plant.records import EVENT, EVENT_ANALOG_FRAME, EVENT_INCLINOMETER, EVENT_TRUTH, EVENTS_TYPE, PLANT_TYPE
-from softloop.plant.records import STATE_TYPE as PLANT_STATE_TYPE
-from softloop.plant.setup import new_device, new_state, plant_record
-from softloop.wire.kernel import array_of, kernel, new_record, record_dtype, record_type
-from softloop.wire.messages import message
+from softloop.plant.records import EVENT
+from softloop.plant.setup import WireTimes, new_device, new_state, plant_record
+from softloop.wire.can_config import CanConfig
+from softloop.wire.config import PaceConfig
+from softloop.wire.kernel import new_record
+from softloop.wire.messages import names_of
+from softloop.wire.schedule import PERIOD_NS, START_NS, Schedule, make_schedule
 
-_F8, _I8 = types.f8, types.i8
-TRUTH = message("PlantTruth").dtype
-SETTLE_TICKS = 40  # before the first tick: the sensors' first samples arrive
-_PENDING = 128  # samples under way; at 200 Hz enough for 600 ms of added delay
-
-WIRING = record_dtype([("loop_delay_ns", "i8"), ("frame_ns", "i8"), ("zero_v", "f8"), ("full_v", "f8"), ("span_kpa", "f8")])
-WIRING_TYPE = record_type(WIRING)
-PENDING = record_dtype([("events", EVENT, (_PENDING,)), ("head", "i8"), ("count", "i8")])
-PENDING_TYPE = record_type(PENDING)
+Records = NDArray[Any]
+_REASONS = names_of("ValveStatus", "REASON_")
+_EVENTS = 64
+SETTLE_S, VENT_S = 0.5, 0.0
 
 
-@kernel(types.void(PENDING_TYPE, record_type(EVENT)))
-def push(pending: Any, event: Any) -> None:
-    """Put a sample that is under way behind the others; when full, the newest is lost."""
-    if pending.count < _PENDING:
-        pending.events[(pending.head + pending.count) % _PENDING] = event
-        pending.count += 1
+@dataclass(frozen=True)
+class RigTables:
+    """The tables of a bench file that a run without processes needs; see each table's model."""
+
+    controller: ControllerConfig
+    plant: PlantConfig
+    valves: ValvesConfig = field(default_factory=ValvesConfig)
+    pressures: PressuresConfig = field(default_factory=PressuresConfig)
+    inclinometer: InclinometerConfig = field(default_factory=lambda: InclinometerConfig(port="none"))
+    can: dict[str, CanConfig] = field(default_factory=lambda: {"can0": CanConfig()})
+    pace: PaceConfig = field(default_factory=PaceConfig)
 
 
-@kernel(types.void(PLANT_TYPE, PLANT_STATE_TYPE, _I8, EVENTS_TYPE, PENDING_TYPE))
-def run_plant(params: Any, plant: Any, to_ns: int, events: np.ndarray, pending: Any) -> None:
-    """Bring the plant to `to_ns`; its samples go to `pending`."""
-    while True:
-        count = run_until(params, plant, to_ns, events)
-        for i in range(count):
-            if events[i].kind == EVENT_ANALOG_FRAME or events[i].kind == EVENT_INCLINOMETER:
-                push(pending, events[i])
-        if plant.reached_ns >= to_ns and not (count > 0 and events[count - 1].kind == EVENT_TRUTH):
-            return
+@dataclass
+class Trace:
+    """All that a run leaves, in the messages' own records; see `loop_kernels.simulate`."""
 
-
-@kernel(types.void(PENDING_TYPE, _I8, WIRING_TYPE, INPUTS_TYPE))
-def deliver(pending: Any, now_ns: int, wiring: Any, inputs: Any) -> None:
-    """Hand over every sample that has arrived by `now_ns`; the newest of each device is what the controller sees."""
-    for _ in range(pending.count):
-        event = pending.events[pending.head]
-        if event.end_ns > now_ns:
-            pending.head = (pending.head + 1) % _PENDING  # look at all once: the two devices' arrivals may cross
-            pending.events[(pending.head + pending.count - 1) % _PENDING] = event
-            continue
-        pending.head = (pending.head + 1) % _PENDING
-        pending.count -= 1
-        if event.kind == EVENT_ANALOG_FRAME:
-            inputs.pressure.seq += 1
-            inputs.pressure.stamp_ns = event.sample_ns
-            inputs.pressure.supply_pressure_kpa = counts_to_kpa(event.raw[0], wiring.zero_v, wiring.full_v, wiring.span_kpa)
-            inputs.pressure.chamber_pressure_kpa = counts_to_kpa(event.raw[1], wiring.zero_v, wiring.full_v, wiring.span_kpa)
-        else:
-            inputs.inclination.seq += 1
-            inputs.inclination.stamp_ns = event.sample_ns
-            inputs.inclination.rate_deg_s = counts_to_deg_s(event.raw[0])
-            inputs.inclination.angle_deg = counts_to_deg(event.raw[1])
-
-
-@kernel(
-    types.void(
-        CONFIG_TYPE, MODEL_TYPE, GAINS_TYPE, array_of(_F8), array_of(_F8, 2), INPUTS_TYPE, CONTROLLER_STATE_TYPE, SCRATCH_TYPE,
-        STEP1_TYPE, PLANT_TYPE, PLANT_STATE_TYPE, EVENTS_TYPE, PENDING_TYPE, WIRING_TYPE, array_of(CYCLE_TYPE),
-        array_of(record_type(TRUTH)),
-    )
-)  # fmt: skip
-def simulate(
-    config: Any, model: Any, gains: Any, knots: np.ndarray, table: np.ndarray, inputs: Any, state: Any, scratch: Any, first: Any,
-    params: Any, plant: Any, events: np.ndarray, pending: Any, wiring: Any, cycles: np.ndarray, truths: np.ndarray,
-) -> None:  # fmt: skip
-    """Run one tick per place of `cycles`; `cycles` and `truths` are filled."""
-    start_ns = plant.reached_ns + SETTLE_TICKS * config.period_ns
-    inputs.valves.gate, inputs.valves.output, inputs.valves.seq = GATE_ARMED, OUTPUT_PASS, 1
-    for k in range(cycles.size):
-        now_ns = start_ns + k * config.period_ns
-        run_plant(params, plant, now_ns, events, pending)
-        deliver(pending, now_ns, wiring, inputs)
-        inputs.now_ns, inputs.tick = now_ns, k
-        controller_tick(config, model, gains, knots, table, inputs, state, scratch, first, cycles[k])
-        truths[k] = plant.truth
-        charge, exhaust = current_to_counts(state.charge_ma), current_to_counts(state.exhaust_ma)
-        end_ns = now_ns + wiring.loop_delay_ns + wiring.frame_ns
-        accept_command(params, plant, end_ns, charge, exhaust, OUTPUT_PASS, k % 65536)
+    cycles: Records
+    truths: Records
+    statuses: Records
+    pressures: Records
+    inclinations: Records
 
 
 @dataclass
 class Run:
-    """What a simulated run leaves: one `CycleRecord` and one `PlantTruth` per tick."""
+    """A simulated run from its first armed tick to the end of its trajectory: a `CycleRecord` and a `PlantTruth` per tick.
 
-    cycles: NDArray[Any]
-    truths: NDArray[Any]
+    Attributes:
+        fault: why the gate went to FAULT; empty when it did not. A run with a fault did not follow its trajectory.
+        completed: it followed the trajectory to its end.
+    """
+
+    cycles: Records
+    truths: Records
+    fault: str = ""
+    completed: bool = True
 
 
-def simulate_run(controller: ControllerConfig, plant: PlantConfig, loop_delay_ns: int = 600_000) -> Run:
-    """One whole run, approach and trajectory, in this process. Raises BadFile or BadConfig."""
-    built = build(controller)
-    params = plant_record(plant)
-    state = new_state(params, new_device(plant), 1_000_000_000)
-    config, pending = built.config[0], new_record(PENDING)
-    ticks = (int(config.approach_ns) + built.plan.duration_ns) // PERIOD_NS
-    cycles, truths = np.zeros(ticks, CYCLE), np.zeros(ticks, TRUTH)
-    simulate(
-        config, built.model[0], built.gains[0], built.plan.knots, built.plan.table, built.inputs[0], built.state[0],
-        built.scratch[0], built.first[0], params, state, np.zeros(64, EVENT), pending, _wiring(plant, params, loop_delay_ns),
-        cycles, truths,
+def simulate_run(controller: ControllerConfig, plant: PlantConfig, *, valves: ValvesConfig | None = None) -> Run:
+    """One whole run, approach and trajectory, in this process, with the delays of `[plant]` declared to the gate.
+
+    Raises BadFile or BadConfig.
+    """
+    return simulate_tables(RigTables(controller, plant, valves or declared(ValvesConfig(), plant)))
+
+
+def declared(valves: ValvesConfig, plant: PlantConfig) -> ValvesConfig:
+    """`valves` with the delays that `[plant]` adds declared in its path delay, as a bench with such wires has to."""
+    added_ms = plant.measurement_delay_ms
+    return valves.model_copy(update={"path_delay_ms": valves.path_delay_ms + added_ms})
+
+
+def simulate_tables(tables: RigTables) -> Run:
+    """One whole run of a rig. Raises BadFile or BadConfig."""
+    built = ready_controller(tables.controller)
+    approach_ns = int(built.config[0].approach_ns)
+    schedule = make_schedule(SETTLE_S, 1e-9 * (approach_ns + built.plan.duration_ns) + 0.1, VENT_S)
+    trace = simulate_trace(tables, schedule, built, all_channels=False)
+    return _whole_run(trace, (approach_ns + built.plan.duration_ns) // PERIOD_NS, schedule)
+
+
+def _whole_run(trace: Trace, ticks: int, schedule: Schedule) -> Run:
+    phases = trace.cycles["phase"]
+    active = np.flatnonzero((phases == PHASE_APPROACH) | (phases == PHASE_TRACK))
+    first = int(active[0]) if active.size else (schedule.arm_ns - START_NS) // PERIOD_NS
+    part = slice(first, first + ticks)
+    last = trace.statuses[-1]
+    fault = _REASONS.get(int(last["reason"]), "unknown") if last["gate"] == GATE_FAULT else ""
+    return Run(trace.cycles[part], trace.truths[1:][part], fault, bool((phases == PHASE_DONE).any()))
+
+
+@lru_cache(maxsize=64)
+def _built(config: ControllerConfig) -> Controller:
+    return build(config)
+
+
+def ready_controller(config: ControllerConfig) -> Controller:
+    """A controller that has not ticked yet; what follows from its config alone is made once."""
+    made = _built(config)
+    return Controller(
+        made.config, made.model, made.gains, made.plan, np.zeros_like(made.inputs), made.state.copy(), np.zeros_like(made.cycle),
+        np.zeros_like(made.scratch), np.zeros_like(made.first),
     )  # fmt: skip
-    return Run(cycles, truths)
 
 
-def _wiring(plant: PlantConfig, params: Any, loop_delay_ns: int) -> Any:
-    wiring = new_record(WIRING)
-    sensor = plant.chamber_sensor
-    wiring.loop_delay_ns, wiring.frame_ns = loop_delay_ns, params.electrical.driver_frame_ns
-    wiring.zero_v, wiring.full_v, wiring.span_kpa = sensor.zero_v, sensor.full_v, sensor.span_kpa
-    return wiring
+def simulate_trace(tables: RigTables, schedule: Schedule, built: Controller | None = None, *, all_channels: bool = True) -> Trace:
+    """A run tick by tick as the processes do it at lockstep pace; without `all_channels` samples are not kept, and one status is.
+
+    Raises BadFile or BadConfig.
+    """
+    built = ready_controller(tables.controller) if built is None else built
+    plant = tables.plant
+    buses = tables.can
+    params = plant_record(plant, WireTimes(buses[plant.can_valves].bitrate, buses[plant.can_analog].bitrate))
+    state = new_state(params, new_device(plant), START_NS)
+    link, between = link_record(tables, params, schedule), new_record(BETWEEN)
+    between.analog.counter = -1
+    ticks = schedule.ticks - 1
+    cycles, truths = np.zeros(ticks, CYCLE), np.zeros(schedule.ticks, TRUTH)
+    kept = 2 * schedule.ticks if all_channels else 0
+    statuses = np.zeros(ticks + SHUTDOWN_FRAMES, VALVE_STATUS) if all_channels else no_records(VALVE_STATUS)
+    pressures, inclinations = np.zeros(kept, PRESSURE), np.zeros(kept, INCLINATION)
+    simulate(
+        built.config[0], built.model[0], built.gains[0], built.plan.knots, built.plan.table, built.inputs[0], built.state[0],
+        built.scratch[0], built.first[0], params, state, np.zeros(_EVENTS, EVENT), link, between, cycles, truths, statuses,
+        pressures, inclinations,
+    )  # fmt: skip
+    if not all_channels:
+        statuses = built.inputs["valves"].copy()
+    return Trace(cycles, truths, statuses, pressures[: between.pressures], inclinations[: between.inclinations])
+
+
+def link_record(tables: RigTables, params: Any, schedule: Schedule) -> Any:
+    """The `LINK` record: what the adapters and the gate know of each other and of their wires."""
+    link, inclinometer = new_record(LINK), tables.inclinometer
+    link.latency_ns = 1000 * tables.pace.software_latency_us
+    link.driver_frame_ns, link.analog_frame_ns = params.electrical.driver_frame_ns, params.electrical.analog_frame_ns
+    link.valve_frame_ns = can_frame_ns(ANALOG_DLC, tables.can[tables.plant.can_valves].bitrate)
+    link.sample_bytes_ns = serial_ns(SAMPLE_BYTES, inclinometer.baud)
+    link.arm_ns, link.disarm_ns = schedule.arm_ns, schedule.disarm_ns
+    link.direction, link.zero_deg = inclinometer.direction, inclinometer.zero_deg
+    _fill_sheet(link.supply, tables.pressures.supply)
+    _fill_sheet(link.chamber, tables.pressures.chamber)
+    link.analog = _analog_record(analog_config(pressures_process(tables.pressures, tables.can)))
+    link.sampler = as_record(sampler_bounds(inclinometer), SAMPLER_CONFIG)
+    link.gate = gate_config(valves_process(tables.valves, tables.pressures, inclinometer, tables.can))
+    return link
+
+
+def _fill_sheet(record: Any, sensor: SensorConfig) -> None:
+    record.zero_v, record.full_v, record.span_kpa = sensor.zero_v, sensor.full_v, sensor.span_kpa
+
+
+def _analog_record(config: AnalogConfig) -> Any:
+    record = new_record(ANALOG_CONFIG)
+    for name in ANALOG_CONFIG.names or ():
+        record[name] = getattr(config, name)
+    return record
