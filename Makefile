@@ -9,11 +9,12 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.softloop-is-installed
 SOURCES := wire dynamics devices plant controller watch offline deploy tests benchmarks docs
 
-.PHONY: help setup demo test lint lock clean
+.PHONY: help setup demo test exact lint lock clean
 
 help:
 	@echo 'make demo   set up, then run the two demonstration trajectories on the simulated rig'
 	@echo 'make test   set up, then all tests'
+	@echo 'make exact  set up, then the three exactness contracts for every law, with both cores kept busy'
 	@echo 'make lint   ruff, mypy and the rules of who may import whom'
 	@echo 'make lock   compute requirements.lock again from pyproject.toml'
 	@echo 'make clean  remove the environment, caches and built files; runs/ stays'
@@ -37,8 +38,12 @@ demo: $(STAMP)
 # Tests of a whole rig come last and one at a time: they need the machine for themselves.
 test: $(STAMP)
 	$(BIN)/softloop warm
-	$(BIN)/python -m pytest -m 'not rig'
+	$(BIN)/python -m pytest -m 'not rig and not exact'
 	$(BIN)/python -m pytest -m rig
+
+exact: $(STAMP)
+	$(BIN)/softloop warm
+	$(BIN)/python -m pytest -m exact
 
 lint: $(STAMP)
 	$(BIN)/ruff check $(SOURCES)

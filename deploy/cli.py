@@ -118,10 +118,12 @@ def replay(
 @app.command()
 def same(
     first: Annotated[Path, typer.Argument(metavar="RUN_A", help="A run directory, or a log in it.")],
-    second: Annotated[Path, typer.Argument(metavar="RUN_B", help="Another one.")],
+    second: Annotated[
+        Path | None, typer.Argument(metavar="RUN_B", help="Another one; without it, its bench in one process.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
 ) -> int:
-    """Compare two logs channel by channel, byte by byte: runs at lockstep pace come out the same."""
+    """Compare two lockstep runs byte by byte, or one with the same bench in one process: they come out the same."""
     from softloop.deploy.same import same_runs
 
     return same_runs(first, second, as_json=as_json)
