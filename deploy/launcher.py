@@ -22,6 +22,7 @@ from softloop.deploy.progress import compile_progress
 from softloop.deploy.rig_state import GATE_FAULT, RigState
 from softloop.deploy.router import launcher_wire, remove_sockets
 from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench, make_run_dir
+from softloop.wire.channels import HELLO
 from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, BadConfig
 from softloop.wire.lockstep import Lockstep
 from softloop.wire.schedule import LAUNCHER_ORIGIN, Schedule, make_schedule
@@ -260,8 +261,10 @@ class LockstepLaunch(Launch):
         if self.bench.run.arm:
             requests.send("arm", schedule.arm_ns)
             requests.send("disarm", schedule.disarm_ns)
-            pace.board.wait(lambda: pace.board.marks["valves"].requests >= 2, lambda: "'valves', which has two requests to take")
-        pace.board.wait(lambda: pace.board.tick is not None, lambda: "'plant'", lambda: pace.say(0, schedule.ticks))
+            pace.board.wait(
+                lambda: pace.board.present["valves"].requests >= 2, lambda: "'valves', which has two requests to take"
+            )
+        pace.board.wait(lambda: pace.board.tick is not None, lambda: "'plant'", lambda: pace.say(HELLO, ticks=schedule.ticks))
         return self._trouble()
 
     def _watch_ticks(self) -> Outcome:

@@ -41,11 +41,15 @@ TRUTH = Channel("truth", "PlantTruth", 200.0)
 STATUS = Channel("status", "ProcessStatus", 1.0)
 CAN = Channel("can", "CanFrame", 600.0, realtime=True)  # key: can/<bus>/<arbitration id in hex>
 
-# Lockstep pace alone. Of the priority of what they speak of, so that on a link neither overtakes the other.
-TICK = Channel("tick", "Tick", 200.0, realtime=True, logged=False)
-WATERMARK = Channel("watermark", "Watermark", 1000.0, realtime=True, logged=False)  # key: watermark/<process>
+CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, EVENT, CYCLE, TRUTH, STATUS, CAN)
 
-CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, EVENT, CYCLE, TRUTH, STATUS, CAN, TICK, WATERMARK)
+# Lockstep pace alone, and on keys of their own, which nobody hears who does not ask for them. Of the priority of what they
+# speak of, so that on a link neither overtakes the other.
+PACE_ROOT = "softloop-pace"
+TICK = Channel("tick", "Tick", 200.0, realtime=True, logged=False)
+HELLO = Channel("hello", "Watermark", 0.0, realtime=True, logged=False)
+WATERMARK = Channel("watermark", "Watermark", 200.0, realtime=True, logged=False)
+END = Channel("end", "Watermark", 0.0, realtime=True, logged=False)
 
 
 def key(bench: str, channel: Channel) -> str:
@@ -63,9 +67,9 @@ def alive_key(bench: str, process: str) -> str:
     return f"{ROOT}/{bench}/alive/{process}"
 
 
-def watermark_key(bench: str, process: str) -> str:
-    """Key on which a process says how far it is at lockstep pace."""
-    return f"{ROOT}/{bench}/{WATERMARK.name}/{process}"
+def pace_key(bench: str, channel: Channel, process: str) -> str:
+    """Key on which a process says at lockstep pace what `channel` carries: `softloop-pace/<bench>/<channel>/<process>`."""
+    return f"{PACE_ROOT}/{bench}/{channel.name}/{process}"
 
 
 def channel_of_key(bench: str, full_key: str) -> Channel | None:

@@ -3,11 +3,13 @@
 The plant leads. With each tick it says, per wire, how many frames or bytes it has sent in all and when each piece arrives
 (`Tick`); an adapter takes exactly those, each at its arrival, and then says that it is done and which sample was its last
 (`Watermark`), also when it published nothing. The controller waits for both adapters and the gate's last word, the gate for
-the controller; the plant takes the gate's frame and goes on when all are done. No wait is without an end: one that lasts
-longer than `[pace] timeout_s` names the process that is missing.
+the controller; the plant takes the gate's frame and goes on. No wait is without an end: one that lasts longer than `[pace]
+timeout_s` names the process that is missing. Whoever waits for another that waits itself has more patience than that one, so
+that it is the missing one that is named.
 
-Nothing is sent before everybody is there: each process says that it is (a `Watermark` of tick 0, again and again) once all
-its subscriptions are declared, and who has heard it knows of them, because on a link declarations go before what follows.
+Nothing is sent before everybody is there: each process says hello, again and again, once all its subscriptions are declared,
+and who has heard it knows of them, because on a link declarations go before what follows. At the end each waits for the
+recorder, because what is under way when a session closes is lost.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from typing import Any
 
 import zenoh
 
-from softloop.wire.channels import TICK, WATERMARK, key, watermark_key
+from softloop.wire.channels import END, HELLO, TICK, WATERMARK, Channel, pace_key
 from softloop.wire.config import PaceConfig
 from softloop.wire.errors import Lost
 from softloop.wire.lockstep_inputs import (
@@ -38,7 +40,9 @@ from softloop.wire.schedule import PERIOD_NS, START_NS
 from softloop.wire.session import Inbox, Wire
 from softloop.wire.shell import Stop
 
-PLANT, RECORDER, LAUNCHER = "plant", "recorder", "launcher"
+PLANT, CONTROLLER, VALVES, RECORDER, LAUNCHER = "plant", "controller", "valves", "recorder", "launcher"
+# Times `timeout_s` that is waited for whom: the farther along the chain of a tick, the longer.
+PATIENCE = {CONTROLLER: 1.25, VALVES: 1.5, RECORDER: 1.5, PLANT: 2.0}
 _TICK, _WATERMARK = message("Tick"), message("Watermark")
 _WIRES, _PIECES = constant("Tick", "WIRES"), constant("Tick", "PIECES")
 _HELLO_S = 0.02
@@ -66,18 +70,31 @@ class RigClock:
 
 
 class Board:
-    """What the others have said last: the plant's tick, and each process's watermark."""
+    """What the others have said last: the plant's tick, who is there, and the watermarks of those who are followed."""
 
     def __init__(self, wire: Wire, interrupted: Callable[[], bool], timeout_s: float) -> None:
         self._changed = threading.Condition()
         self._interrupted, self._timeout_s = interrupted, timeout_s
+        self._wire = wire
+        self._declared: list[Any] = []
         self.tick: Any = None
+        self.present: dict[str, Any] = {}
         self.marks: dict[str, Any] = {}
-        declare = wire.session.declare_subscriber
-        self._declared = [
-            declare(key(wire.bench, TICK), zenoh.handlers.Callback(self._take_tick, indirect=False)),
-            declare(watermark_key(wire.bench, "*"), zenoh.handlers.Callback(self._take_mark, indirect=False)),
-        ]
+        self.ended: dict[str, Any] = {}
+        self._listen(TICK, PLANT, self._take_tick)
+        self._listen(HELLO, "*", self._note_in(self.present))
+
+    def follow(self, process: str) -> None:
+        """Hear the watermarks of a process."""
+        self._listen(WATERMARK, process, self._note_in(self.marks))
+
+    def await_end(self, process: str) -> None:
+        """Hear that a process, or "*", is done for good."""
+        self._listen(END, process, self._note_in(self.ended))
+
+    def _listen(self, channel: Channel, process: str, take: Callable[[zenoh.Sample], None]) -> None:
+        handler = zenoh.handlers.Callback(take, indirect=False)
+        self._declared.append(self._wire.session.declare_subscriber(pace_key(self._wire.bench, channel, process), handler))
 
     def _take_tick(self, sample: zenoh.Sample) -> None:
         try:
@@ -89,39 +106,61 @@ class Board:
                 self.tick = tick
                 self._changed.notify_all()
 
-    def _take_mark(self, sample: zenoh.Sample) -> None:
-        try:
-            mark = _WATERMARK.unpack(sample.payload.to_bytes())
-        except BadPayload:
-            return
-        with self._changed:
-            self.marks[str(sample.key_expr).rsplit("/", 1)[1]] = mark
-            self._changed.notify_all()
+    def _note_in(self, board: dict[str, Any]) -> Callable[[zenoh.Sample], None]:
+        def take(sample: zenoh.Sample) -> None:
+            try:
+                mark = _WATERMARK.unpack(sample.payload.to_bytes())
+            except BadPayload:
+                return
+            with self._changed:
+                board[str(sample.key_expr).rsplit("/", 1)[1]] = mark
+                self._changed.notify_all()
+
+        return take
 
     def done(self, process: str) -> int:
-        """How many ticks a process is done with; -1 before its first word."""
+        """How many ticks a followed process is done with."""
         mark = self.marks.get(process)
-        return -1 if mark is None else int(mark.tick)
+        return 0 if mark is None else int(mark.tick)
 
-    def wait(self, ready: Callable[[], bool], missing: Callable[[], str], meanwhile: Callable[[], None] | None = None) -> bool:
-        """Until `ready()`; False when asked to stop. `meanwhile` is called now and then. Raises Lost, naming `missing()`."""
-        end_s = time.monotonic() + self._timeout_s
+    def wait(
+        self,
+        ready: Callable[[], bool],
+        missing: Callable[[], str],
+        meanwhile: Callable[[], None] | None = None,
+        patience: float = 1.0,
+    ) -> bool:
+        """Until `ready()`; False when asked to stop. `meanwhile` is called now and then.
+
+        Raises Lost, naming `missing()`, after `patience` times the timeout.
+        """
+        limit_s = patience * self._timeout_s
+        end_s = time.monotonic() + limit_s
         look_s = _LOOK_S if meanwhile is None else _HELLO_S
         with self._changed:
             while not ready():
                 if self._interrupted():
                     return False
                 if time.monotonic() >= end_s:
-                    raise Lost(f"lockstep: nothing from {missing()} for {self._timeout_s:g} s; the run cannot go on")
+                    raise Lost(f"lockstep: nothing from {missing()} for {limit_s:g} s; the run cannot go on")
                 if not self._changed.wait(look_s) and meanwhile is not None:
                     meanwhile()
         return True
 
+    def wait_done(self, process: str, ticks: int) -> bool:
+        """Until a followed process is done with so many ticks; False when asked to stop. Raises Lost."""
+        return self.wait(
+            lambda: self.done(process) >= ticks,
+            lambda: f"'{process}' on tick {ticks - 1}",
+            patience=PATIENCE.get(process, 1.0),
+        )
+
 
 class Lockstep(Pace):
-    """What leader, followers and launcher share: the board, the clock and the own watermark."""
+    """What leader, followers and launcher share: the board, the clock and the own word."""
 
     exact = True
+    period_ns = PERIOD_NS
 
     def __init__(self, config: PaceConfig, wire: Wire, stop: Stop, others: Collection[str]) -> None:
         """`others`: the processes of this bench, without this one."""
@@ -132,20 +171,26 @@ class Lockstep(Pace):
         self.over = False
         self.requests_in: Callable[[], int] = lambda: 0
         wire.exact, wire.on_put = True, self._note_put
-        publisher = wire.declare_publisher(watermark_key(wire.bench, wire.process), realtime=WATERMARK.realtime)
-        self._put_mark: Callable[[bytes], None] = publisher.put
+        self._put = {c.name: self._publisher(wire, c) for c in (HELLO, WATERMARK, END)}
         self.board = Board(wire, self.interrupted, config.timeout_s)
-        self._marks = self._last_seq = self._sent = self._sent_stamp_ns = 0
+        self.board.await_end("*" if wire.process == RECORDER else RECORDER)
+        self._said = self._last_seq = self._sent = self._sent_stamp_ns = 0
+
+    @staticmethod
+    def _publisher(wire: Wire, channel: Channel) -> Callable[[bytes], None]:
+        publisher = wire.declare_publisher(pace_key(wire.bench, channel, wire.process), realtime=channel.realtime)
+        put: Callable[[bytes], None] = publisher.put
+        return put
 
     def interrupted(self) -> bool:
         """Asked to stop before the run's own end."""
         return bool(self.stop) and not self.over
 
-    def say(self, tick: int, ticks: int = 0) -> None:
-        """Publish the own watermark: done with `tick` ticks."""
-        self._marks += 1
+    def say(self, channel: Channel, tick: int = 0, ticks: int = 0) -> None:
+        """Publish the own word: done with `tick` ticks."""
+        self._said += 1
         mark = _WATERMARK.make(
-            seq=self._marks,
+            seq=self._said,
             stamp_ns=self.clock.now_ns(),
             tick=tick,
             last_seq=self._last_seq,
@@ -154,26 +199,26 @@ class Lockstep(Pace):
             requests=self.requests_in(),
             ticks=ticks,
         )
-        self._put_mark(_WATERMARK.pack(mark))
+        self._put[channel.name](_WATERMARK.pack(mark))
 
     def hello(self) -> None:
         """Say that this process is there."""
-        self.say(0)
+        self.say(HELLO)
 
     def meet(self, wanted: Collection[str], meanwhile: Callable[[], None] | None) -> bool:
-        """Until each of `wanted` has said that it is there; False when asked to stop. Raises Lost, naming who is missing."""
+        """Until each of `wanted` has said hello; False when asked to stop. Raises Lost, naming who is missing."""
+        present = self.board.present
         return self.board.wait(
-            lambda: all(self.board.done(name) >= 0 for name in wanted),
-            lambda: ", ".join(repr(name) for name in wanted if self.board.done(name) < 0),
+            lambda: present.keys() >= set(wanted),
+            lambda: ", ".join(repr(name) for name in wanted if name not in present),
             meanwhile,
         )
 
     def finish(self) -> None:
-        """After the last word of this process: what is still on its way when a session closes is lost, so wait for the log."""
-        if self.over and self.board.tick is not None and RECORDER in self.others:
-            after_all = int(self.board.tick.tick) + 2
-            self.say(after_all)
-            self.board.wait(lambda: self.board.done(RECORDER) >= after_all, lambda: f"'{RECORDER}'")
+        """After the last word of this process."""
+        if self.over and RECORDER in self.others:
+            self.say(END)
+            self.board.wait(lambda: RECORDER in self.board.ended, lambda: f"'{RECORDER}'")
 
     def end(self) -> None:
         """The run is over as planned."""
@@ -197,7 +242,9 @@ class Leader(Lockstep):
     def __init__(self, config: PaceConfig, wire: Wire, stop: Stop, others: Collection[str]) -> None:
         super().__init__(config, wire, stop, others)
         self.rig_clock.on_sleep = self._end_tick
-        self._put_tick = wire.publisher(TICK)
+        self._put_tick = self._publisher(wire, TICK)
+        self.board.follow(VALVES)
+        self.board.follow(RECORDER)
         self.target_ns = START_NS  # the rig clock of the tick in hand, once the frames of the last one are taken
         self._tick = self._ticks = 0
         self._pieces: list[list[tuple[int, int]]] = [[] for _ in range(_WIRES)]
@@ -205,7 +252,7 @@ class Leader(Lockstep):
 
     def begin(self) -> None:
         if self.meet([*self.others, LAUNCHER], self.hello):
-            self._ticks = int(self.board.marks[LAUNCHER].ticks)
+            self._ticks = int(self.board.present[LAUNCHER].ticks)
 
     def note_piece(self, wire: int, amount: int, arrival_ns: int) -> None:
         self._on_wire[wire] += amount
@@ -218,20 +265,13 @@ class Leader(Lockstep):
         last = self._tick + 1 >= self._ticks
         self._announce(last)
         done = self._tick + 1
-        control = [name for name in self.others if name != RECORDER]
-        self._wait_for(control, done)
+        self.board.wait_done(VALVES, done)
         if RECORDER in self.others:
-            self._wait_for([RECORDER], done - RECORDER_TICKS)
+            self.board.wait_done(RECORDER, done - RECORDER_TICKS)
         if last:
             self.end()
         self._tick += 1
         self.target_ns += PERIOD_NS
-
-    def _wait_for(self, names: list[str], ticks: int) -> None:
-        self.board.wait(
-            lambda: all(self.board.done(name) >= ticks for name in names),
-            lambda: f"{', '.join(repr(n) for n in names if self.board.done(n) < ticks)} on tick {self._tick}",
-        )
 
     def _announce(self, last: bool) -> None:
         piece_end, arrival_ns = [0] * (_WIRES * _PIECES), [0] * (_WIRES * _PIECES)
@@ -253,8 +293,6 @@ class Leader(Lockstep):
 class Follower(Lockstep):
     """Every process but the plant."""
 
-    period_ns = PERIOD_NS
-
     def __init__(self, config: PaceConfig, wire: Wire, stop: Stop, others: Collection[str]) -> None:
         super().__init__(config, wire, stop, others)
         self.rig_clock.on_sleep = self._sleep_until
@@ -268,13 +306,23 @@ class Follower(Lockstep):
 
     def keep_up(self, take: Callable[[], object]) -> None:
         newest = self.board.tick
-        ended = newest is not None and newest.last and all(self.board.done(n) > newest.tick + 1 for n in self.others)
+        all_ended = self.board.ended.keys() >= set(self.others)
         take()
-        self.say(0 if newest is None else int(newest.tick) + (2 if ended else 1))
+        if newest is None:
+            self.hello()
+        else:
+            self.say(WATERMARK, int(newest.tick) + 1)
+        if all_ended:
+            self.say(END)
+
+    def finish(self) -> None:
+        if self.over:
+            self._mark_done()
+        super().finish()
 
     def _mark_done(self) -> None:
         if self.tick is not None:
-            self.say(int(self.tick.tick) + 1)
+            self.say(WATERMARK, int(self.tick.tick) + 1)
 
     def next_tick(self) -> bool:
         """Be done with the tick in hand and wait for the next; False when none follows, or when asked to stop."""
@@ -287,6 +335,7 @@ class Follower(Lockstep):
             lambda: self.board.tick is not None and self.board.tick.seq > after,
             lambda: f"'{PLANT}'",
             None if after else self.hello,
+            PATIENCE[PLANT],
         )
         if there:
             self._take(self.board.tick)
@@ -305,10 +354,6 @@ class Follower(Lockstep):
         if self.tick is not None and self.tick.last:
             self.end()
 
-    def wait_done(self, process: str, ticks: int) -> bool:
-        """Until a process is done with so many ticks; False when asked to stop."""
-        return self.board.wait(lambda: self.board.done(process) >= ticks, lambda: f"'{process}' on tick {ticks - 1}")
-
     def _sleep_until(self, deadline_ns: int) -> None:
         while self.clock.now_ns() < deadline_ns and not self.stop and self.next_tick():
             pass
@@ -316,7 +361,7 @@ class Follower(Lockstep):
             self.rig_clock.set(deadline_ns)
             return
         for process, lag in self._inputs:
-            self.wait_done(process, int(self.tick.tick) + 1 - lag)
+            self.board.wait_done(process, int(self.tick.tick) + 1 - lag)
         self.end_with_this()
 
     def awaited(self, take: Callable[[float], Any], what: str) -> Any:
@@ -341,11 +386,13 @@ class Follower(Lockstep):
         return PacedBytes(self, source, wire)
 
     def commands(self, source: Queue) -> Queue:
+        self.board.follow(CONTROLLER)
         return PacedCommands(self, source)
 
     def requests(self, source: Inbox) -> Requests:
         return PacedRequests(self, source)
 
     def newest(self, source: Newest, process: str, lag: int = 0) -> Newest:
+        self.board.follow(process)
         self._inputs.append((process, lag))
         return PacedNewest(self, source, process)

@@ -92,7 +92,7 @@ class PacedCommands:
     def take(self, timeout_s: float = 0.0) -> tuple[str, bytes] | None:
         pace = self._pace
         until_ns = pace.clock.now_ns() + ceil(timeout_s * 1e9)
-        if not pace.next_tick() or not pace.wait_done(_CONTROLLER, int(pace.tick.tick) + 1):
+        if not pace.next_tick() or not pace.board.wait_done(_CONTROLLER, int(pace.tick.tick) + 1):
             return None
         pace.end_with_this()
         pace.rig_clock.set(pace.tick.stamp_ns + pace.latency_ns)

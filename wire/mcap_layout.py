@@ -23,7 +23,7 @@ from typing import Any
 
 from mcap.writer import CompressionType, IndexType, Writer
 
-from softloop.wire.channels import CAN, CHANNELS, ROOT, WATERMARK, Channel, key
+from softloop.wire.channels import CAN, CHANNELS, ROOT, Channel, key
 from softloop.wire.messages import CDR_HEADER, MessageType, message
 
 PROFILE = "ros2"
@@ -75,8 +75,6 @@ def split_topic(topic: str) -> tuple[str, str, tuple[str, int] | None] | None:
     parts = topic.split("/")
     if len(parts) < 4 or parts[0] or parts[1] != ROOT:
         return None
-    if parts[3] == WATERMARK.name:
-        return (parts[2], parts[3], None) if len(parts) == 5 else None
     if parts[3] != CAN.name:
         return (parts[2], parts[3], None) if len(parts) == 4 else None
     number = _hex_number(parts[5]) if len(parts) == 6 else None
