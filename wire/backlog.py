@@ -33,7 +33,7 @@ class Backlog:
     def take_all(self) -> tuple[list[tuple[str, bytes]], bool]:
         """(key, payload) of all that waits, oldest first, without waiting; and whether as much came as can wait."""
         take = self._subscriber.try_recv
-        taken = []
+        taken: list[tuple[str, bytes]] = []
         for _ in range(self._capacity):
             sample = take()
             if sample is None:

@@ -2,7 +2,8 @@
 
 The rare records (header, schemas, channels, attachments, indexes, summary) are built by the mcap library. A message is packed at
 once into the chunk in progress, and only its time and place are noted, from which the chunk's indexes are made when it closes.
-Schemas and channels stand outside the chunks, before their first message, so that a damaged chunk takes no channel with it.
+Schemas and channels stand twice, before the chunk of their first message and in it: a damaged chunk takes no channel with it, and
+the one in the chunk has a checksum.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import struct
 import zlib
 from array import array
+from collections.abc import Sequence
 from typing import Any
 
 import lz4.frame
@@ -63,6 +65,11 @@ class ChunkedWriter:
         self._stream.write(data)
         return at, len(data)
 
+    def _write_twice(self, record: McapRecord) -> None:
+        """Before all messages that need it, and in the next chunk, whose checksum shows damage."""
+        self._write(record)
+        self._records += _bytes_of(record)
+
     def add_attachment(self, time_ns: int, name: str, media_type: str, data: bytes) -> None:
         attachment = Attachment(create_time=time_ns, log_time=time_ns, name=name, media_type=media_type, data=data)
         at, length = self._write(attachment)
@@ -75,19 +82,19 @@ class ChunkedWriter:
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Returns the schema's id."""
         self._schemas.append(Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data))
-        self._write(self._schemas[-1])
+        self._write_twice(self._schemas[-1])
         return len(self._schemas)
 
     def add_channel(self, topic: str, message_encoding: str, schema_id: int) -> int:
         """Returns the channel's id."""
         number = len(self._channels) + 1
         self._channels.append(Channel(number, topic, message_encoding, {}, schema_id))
-        self._write(self._channels[-1])
+        self._write_twice(self._channels[-1])
         self._counts[number] = 0
         return number
 
     def add_message(self, channel_id: int, log_time: int, sequence: int, payload: bytes) -> None:
-        """Pack a message into the chunk in progress; a chunk that is full is closed. Raises struct.error on a number too large."""
+        """Pack a message into the chunk in progress; a chunk that is full is closed. struct.error on too large a number."""
         places = self._places.get(channel_id)
         if places is None:
             places = self._places[channel_id] = array("Q")
@@ -102,7 +109,7 @@ class ChunkedWriter:
 
     def flush(self) -> None:
         """Close the chunk in progress and write it with its message indexes; nothing when it holds no message."""
-        if not self._records:
+        if not self._places:
             return
         data, places = bytes(self._records), self._places
         self._records, self._places = bytearray(), {}
@@ -134,10 +141,17 @@ class ChunkedWriter:
         self.flush()
         self._write(DataEnd(0))
         start = self._stream.tell()
-        summary, offsets = bytearray(), []
-        groups = (self._schemas, self._channels, [self._statistics()], self._chunks, self._attachments, self._metadata)
-        codes = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX)
-        for code, group in zip((*codes, Opcode.METADATA_INDEX), groups, strict=True):
+        summary = bytearray()
+        offsets: list[SummaryOffset] = []
+        groups: dict[Opcode, Sequence[McapRecord]] = {
+            Opcode.SCHEMA: self._schemas,
+            Opcode.CHANNEL: self._channels,
+            Opcode.STATISTICS: [self._statistics()],
+            Opcode.CHUNK_INDEX: self._chunks,
+            Opcode.ATTACHMENT_INDEX: self._attachments,
+            Opcode.METADATA_INDEX: self._metadata,
+        }
+        for code, group in groups.items():
             before = len(summary)
             summary += b"".join(_bytes_of(record) for record in group)
             if len(summary) > before:
