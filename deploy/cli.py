@@ -25,6 +25,10 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 130},
 )
 
+log_app = typer.Typer(help="Look at a run's log, and mend it.", rich_markup_mode=None)
+app.add_typer(log_app, name="log")
+
+RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run directory, or a log in it.")]
 BenchArgument = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="A bench file, or the name of a shipped one (sim).")]
 RunDir = Annotated[Path, typer.Option(metavar="DIR", help="The run's directory.")]
 
@@ -113,6 +117,25 @@ def replay(
     from softloop.deploy.replay import replay_run
 
     return replay_run(run, controller, as_json=as_json)
+
+
+@log_app.command("check")
+def log_check(run: RunArgument, as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False) -> int:
+    """What a log holds, its gaps by sequence number per channel, and its loss windows; exit code 1 when something is missing."""
+    from softloop.deploy.log_tools import check_run
+
+    return check_run(run, as_json=as_json)
+
+
+@log_app.command("repair")
+def log_repair(
+    run: RunArgument,
+    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE", help="Default: in place.")] = None,
+) -> int:
+    """Write a good file from a damaged log; in place, the damaged one is kept beside it as *.damaged."""
+    from softloop.deploy.log_tools import repair_run
+
+    return repair_run(run, output)
 
 
 @app.command()

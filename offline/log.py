@@ -2,7 +2,8 @@
 
 The file is walked record by record; each chunk is checked, its messages are found by one compiled scan, and those of one
 channel are copied as rows, so that there is no Python loop per message. Nothing in the file is trusted: a damaged chunk is
-left out and named, and where the framing itself is lost reading ends there. `Log.problems` says what is missing.
+left out and named, and where the framing itself is lost reading goes on at the next sound chunk. `Log.problems` says what is
+missing.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -26,23 +27,23 @@ from mcap.records import Attachment, Channel, Chunk, Metadata, Schema, Statistic
 from numba import types
 from numpy.typing import NDArray
 
+from softloop.offline.mcap_walk import RECORD, FileRecords
 from softloop.wire.channels import CAN, CHANNELS
 from softloop.wire.errors import BadFile
 from softloop.wire.kernel import array_of, kernel
+from softloop.wire.mcap_chunks import MAGIC
 from softloop.wire.mcap_layout import METADATA_NAME, SCHEMA_ENCODING, Origin, split_topic
 from softloop.wire.messages import CDR_HEADER, PACKAGE, MessageType, message
 
-MAGIC = b"\x89MCAP0\r\n"
 Records = NDArray[Any]
 Bytes = NDArray[np.uint8]
 CanKey = tuple[str, int]
 
-_RECORD = struct.Struct("<BQ")  # opcode and length before every record
 _MESSAGE_HEAD = 22  # channel id u16, sequence u32, log time u64, publish time u64
 _LZ4_RATIO_MAX = 260  # LZ4 cannot expand more than 255 times; zstd's window is bounded by _CHUNK_MAX alone
 _CHUNK_MAX = 1 << 30
 # What a damaged record can raise while it is parsed.
-_DAMAGE = (McapError, struct.error, ValueError, KeyError, RuntimeError, OverflowError, MemoryError, EOFError, zstandard.ZstdError)
+DAMAGE = (McapError, struct.error, ValueError, KeyError, RuntimeError, OverflowError, MemoryError, EOFError, zstandard.ZstdError)
 _SILENT = {Opcode.HEADER, Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX}
 _SILENT |= {Opcode.SUMMARY_OFFSET, Opcode.DATA_END, Opcode.FOOTER}
 
@@ -174,7 +175,8 @@ class _Reader:
         }
 
     def read(self, view: memoryview) -> Log:
-        for opcode, at, content in self._walk(view):
+        records = FileRecords(view)
+        for opcode, at, content in records:
             if opcode in _SILENT:
                 continue
             handler = self._handlers.get(opcode)
@@ -183,8 +185,10 @@ class _Reader:
                 continue
             try:
                 handler(bytes(content))
-            except _DAMAGE as error:
+            except DAMAGE as error:
                 self._problem(f"damaged {Opcode(opcode).name.lower()} at byte {at}, left out: {_first_line(error)}")
+                records.damaged()
+        self._say_what_is_cut(records, len(view))
         self._resolve()
         self._check_counts()
         return self.log
@@ -192,27 +196,16 @@ class _Reader:
     def _problem(self, text: str) -> None:
         self.log.problems.append(text)
 
-    def _walk(self, view: memoryview) -> Iterator[tuple[int, int, memoryview]]:
-        at, finished = len(MAGIC), False
-        while at < len(view):
-            if view[at : at + len(MAGIC)] == MAGIC and at + len(MAGIC) == len(view):
-                finished = True
-                break
-            if at + _RECORD.size > len(view):
-                break
-            opcode, length = _RECORD.unpack_from(view, at)
-            start = at + _RECORD.size
-            if start + length > len(view):
-                break
-            yield opcode, at, view[start : start + length]
-            at = start + length
-        if not finished:
-            left = len(view) - at
-            self._problem(f"the file was not finished or is cut off: it can be read up to byte {at}, {left} bytes follow")
+    def _say_what_is_cut(self, records: FileRecords, size: int) -> None:
+        for start, end in records.skipped:
+            self._problem(f"{end - start} bytes from byte {start} on are no records, left out")
+        if not records.finished:
+            left = size - records.at
+            self._problem(f"the file was not finished or is cut off: it can be read up to byte {records.at}, {left} bytes follow")
 
     def _chunk(self, content: bytes) -> None:
         chunk = Chunk.read(_stream(content))
-        data = _decompress(chunk)
+        data = decompress(chunk)
         if len(data) != chunk.uncompressed_size:
             raise ValueError(f"{len(data)} bytes where {chunk.uncompressed_size} are declared")
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
@@ -220,8 +213,8 @@ class _Reader:
         self._records_of_chunk(np.frombuffer(data, np.uint8))
 
     def _records_of_chunk(self, data: Bytes) -> None:
-        if self._found.shape[0] < data.size // _RECORD.size + 1:
-            self._found = np.empty((data.size // _RECORD.size + 1, 4), np.int64)
+        if self._found.shape[0] < data.size // RECORD.size + 1:
+            self._found = np.empty((data.size // RECORD.size + 1, 4), np.int64)
         count = find_messages(data, self._found)
         if count < 0:
             raise ValueError("its records do not fit its size")
@@ -229,7 +222,7 @@ class _Reader:
         for opcode, _, start, length in found[found[:, 0] != Opcode.MESSAGE].tolist():
             handler = {Opcode.SCHEMA: self._schema, Opcode.CHANNEL: self._channel}.get(opcode)
             if handler is not None:
-                handler(data[start : start + length].tobytes())
+                handler(data[start : start + length].tobytes(), sure=True)
         self._keep(data, found[found[:, 0] == Opcode.MESSAGE])
 
     def _keep(self, data: Bytes, found: NDArray[np.int64]) -> None:
@@ -260,13 +253,16 @@ class _Reader:
             raise ValueError("too short")
         self._keep_rows(data, channel_id, np.array([0]), data.size)
 
-    def _schema(self, content: bytes) -> None:
+    def _schema(self, content: bytes, *, sure: bool = False) -> None:
+        """One that stands in a chunk with a good checksum is `sure`, and taken before those outside."""
         schema = Schema.read(_stream(content))
-        self.schemas.setdefault(schema.id, schema)
+        if sure or schema.id not in self.schemas:
+            self.schemas[schema.id] = schema
 
-    def _channel(self, content: bytes) -> None:
+    def _channel(self, content: bytes, *, sure: bool = False) -> None:
         channel = Channel.read(_stream(content))
-        self.topics.setdefault(channel.id, channel)
+        if sure or channel.id not in self.topics:
+            self.topics[channel.id] = channel
 
     def _attachment(self, content: bytes) -> None:
         attachment = Attachment.read(_stream(content))
@@ -291,7 +287,7 @@ class _Reader:
             n_rows = sum(len(b) for b in blocks)
             try:
                 self._file_under(self._topic(channel_id), self._kind(channel_id), blocks)
-            except _DAMAGE as error:
+            except DAMAGE as error:
                 self._problem(f"{n_rows} messages of channel id {channel_id} left out: {_first_line(error)}")
             blocks.clear()
 
@@ -345,7 +341,8 @@ def _first_line(error: BaseException) -> str:
     return (str(error) or type(error).__name__).splitlines()[0][:120]
 
 
-def _decompress(chunk: Chunk) -> bytes:
+def decompress(chunk: Chunk) -> bytes:
+    """The records of a chunk. Raises what its library raises on damage, and ValueError on sizes that cannot be."""
     size = chunk.uncompressed_size
     if size > _CHUNK_MAX:
         raise ValueError(f"{size} bytes declared")

@@ -1,7 +1,7 @@
 """The recorder: every message of a bench into one MCAP file, and an account of what is missing.
 
 What it drops, it counts, by these rules:
-- backlog: more messages wait than `backlog_messages`: the oldest go;
+- backlog: more messages wait than `backlog_messages`: the oldest go, and the senders' numbers say how many;
 - storage: the disk has not taken `unwritten_mib` of finished bytes: new messages go until it takes them again. Nothing that
   was written becomes invalid: the file goes on at the byte at which the disk refused;
 - malformed: a payload that is not the message of its channel is counted and not logged, because a log whose bytes do not fit
@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import Any
 
 from softloop.watch.config import RecorderConfig
+from softloop.wire.backlog import Backlog
 from softloop.wire.channels import CAN, EVENT, STATUS, Channel
 from softloop.wire.errors import Unavailable
 from softloop.wire.mcap_layout import BadMessage, LogWriter, attachments_of, known_channel, read_origin, topic_of_key
 from softloop.wire.messages import constant, message
-from softloop.wire.session import Inbox
 from softloop.wire.shell import Context, say
 
 NAME = "recorder"
@@ -69,9 +69,6 @@ class Sink:
     def tell(self) -> int:
         return self.stored + len(self._waiting)
 
-    def flush(self) -> None:
-        """Nothing: bytes go to the disk by `store`, whose errors the recorder handles."""
-
     def store(self) -> None:
         """Give to the disk what waits. Raises OSError when it does not take all; the rest stays."""
         while self._waiting:
@@ -93,11 +90,14 @@ class Sequence:
     missing: int = 0
     backward: int = 0  # numbers at or below one seen before: repeated, out of order, or a sender that started anew
 
-    def note(self, seq: int) -> None:
+    def note(self, seq: int) -> int:
+        """Count a message; returns how many are missing before it."""
+        gap = max(0, seq - self.last - 1) if seq != self.last + 1 else 0
         self.messages += 1
-        self.missing += max(0, seq - self.last - 1)
+        self.missing += gap
         self.backward += seq <= self.last
         self.last = seq
+        return gap
 
 
 @dataclass
@@ -110,28 +110,38 @@ class Account:
     storage: int = 0
     malformed: int = 0
     unknown: int = 0
+    missing: int = 0  # numbers that never came, of all sequences together: what the senders dropped and the backlog
     storage_errors: list[str] = field(default_factory=list)
+    _by_key: dict[tuple[str, int], Sequence] = field(default_factory=dict)  # the same by the key they come on, for speed
 
     @property
     def dropped(self) -> int:
         return self.backlog + self.storage + self.malformed
 
     def note(self, full_key: str, n_bytes: int, seq: int, sender: int) -> None:
-        count = self.topics.setdefault(full_key, [0, 0])
+        count = self.topics.get(full_key)
+        if count is None:
+            count = self.topics[full_key] = [0, 0]
         count[0] += 1
         count[1] += n_bytes
+        sequence = self._by_key.get((full_key, sender))
+        if sequence is not None:
+            self.missing += sequence.note(seq)
+            return
         name = (_counted_over(full_key), sender) if sender else (full_key, 0)
         sequence = self.sequences.get(name)
         if sequence is None:
-            self.sequences[name] = Sequence(seq, seq)
+            sequence = self.sequences[name] = Sequence(seq, seq)
         else:
-            sequence.note(seq)
+            self.missing += sequence.note(seq)
+        self._by_key[full_key, sender] = sequence
 
     def as_dict(self, stored: int, *, finished: bool) -> dict[str, Any]:
         return {
             "finished": finished,
             "bytes_in_file": stored,
             "messages": sum(count[0] for count in self.topics.values()),
+            "missing": self.missing,
             "dropped_backlog": self.backlog,
             "dropped_storage": self.storage,
             "malformed": self.malformed,
@@ -157,7 +167,7 @@ class Recorder:
         self.config = config
         self.context = context
         self.account = Account()
-        self.inbox: Inbox = context.wire.everything(config.backlog_messages)
+        self.inbox: Backlog = context.wire.everything(config.backlog_messages)
         self.sink = Sink(context.run_dir / config.file)
         origin = read_origin(context.bench, context.clock.now_ns())
         attachments = attachments_of(context.run_dir)
@@ -177,7 +187,8 @@ class Recorder:
 
     def take(self) -> int:
         """Write what has arrived; how many messages came."""
-        arrived = self.inbox.take_all()
+        arrived, overrun = self.inbox.take_all()
+        missing_before = self.account.missing
         full = self.sink.waiting > self.config.unwritten_mib << 20
         for full_key, payload in arrived:
             channel = self._channel(full_key)
@@ -189,7 +200,8 @@ class Recorder:
                 self.account.storage += 1
             else:
                 self._write(full_key, channel, payload)
-        self.account.backlog = self.inbox.dropped
+        if overrun:
+            self.account.backlog += self.account.missing - missing_before
         return len(arrived)
 
     def _channel(self, full_key: str) -> Channel | None:

@@ -21,9 +21,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from mcap.writer import CompressionType, IndexType, Writer
-
 from softloop.wire.channels import CAN, CHANNELS, ROOT, Channel, key
+from softloop.wire.mcap_chunks import ChunkedWriter
 from softloop.wire.messages import CDR_HEADER, MessageType, message
 
 PROFILE = "ros2"
@@ -111,7 +110,7 @@ class _Lane:
 
 
 class LogWriter:
-    """Writes messages into one MCAP file of this layout, given a stream with `write`, `tell` and `flush`.
+    """Writes messages into one MCAP file of this layout, given a stream with `write` and `tell`.
 
     Not thread-safe; errors of the stream pass through.
     """
@@ -120,13 +119,9 @@ class LogWriter:
         self.origin = origin
         self._lanes: dict[str, _Lane] = {}
         self._schemas: dict[str, int] = {}
-        self._writer = Writer(
-            stream, chunk_size=chunk_bytes, compression=CompressionType.LZ4, index_types=IndexType.ALL, enable_crcs=True
-        )
-        self._writer.start(PROFILE, LIBRARY)
+        self._writer = ChunkedWriter(stream, PROFILE, LIBRARY, chunk_bytes)
         for name, data in attachments.items():
-            media = MEDIA_TYPES.get(Path(name).suffix, "text/plain")
-            self._writer.add_attachment(origin.wall_ns, origin.wall_ns, name, media, data)
+            self._writer.add_attachment(origin.wall_ns, name, media_type(name), data)
         self._writer.add_metadata(METADATA_NAME, origin.as_metadata())
         for channel in CHANNELS:
             if channel.logged and channel is not CAN:
@@ -144,16 +139,16 @@ class LogWriter:
         log_time = self.origin.log_time_ns(stamp_ns)
         if not 0 <= log_time < _U64_END:
             raise BadMessage(f"{full_key}: stamp {stamp_ns} ns is no time")
-        self._writer.add_message(lane.channel_id, log_time, payload, log_time, seq & 0xFFFFFFFF)
+        self._writer.add_message(lane.channel_id, log_time, seq & 0xFFFFFFFF, payload)
         return seq, int.from_bytes(payload[lane.sender], "little") if lane.sender else 0
 
     def _lane(self, full_key: str, channel: Channel) -> _Lane:
         kind = message(channel.message)
         schema = self._schemas.get(kind.ros_name)
         if schema is None:
-            schema = self._writer.register_schema(kind.ros_name, SCHEMA_ENCODING, kind.text.encode())
+            schema = self._writer.add_schema(kind.ros_name, SCHEMA_ENCODING, kind.text.encode())
             self._schemas[kind.ros_name] = schema
-        channel_id = self._writer.register_channel(topic_of_key(full_key), MESSAGE_ENCODING, schema)
+        channel_id = self._writer.add_channel(topic_of_key(full_key), MESSAGE_ENCODING, schema)
         lane = self._lanes[full_key] = _Lane(channel_id, kind, _sender_bytes(kind))
         return lane
 
@@ -164,6 +159,11 @@ class LogWriter:
     def finish(self) -> None:
         """Write summary and end mark; nothing may be added after."""
         self._writer.finish()
+
+
+def media_type(name: str) -> str:
+    """The media type of an attachment, by the end of its name."""
+    return MEDIA_TYPES.get(Path(name).suffix, "text/plain")
 
 
 def _sender_bytes(kind: MessageType) -> slice | None:

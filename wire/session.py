@@ -16,6 +16,7 @@ from typing import Any
 
 import zenoh
 
+from softloop.wire.backlog import Backlog
 from softloop.wire.channels import ROOT, Channel, alive_key, key
 from softloop.wire.config import ZenohConfig
 from softloop.wire.errors import Unavailable
@@ -142,17 +143,8 @@ class Inbox:
     def __init__(self, session: zenoh.Session, key_expr: str, capacity: int = 4096) -> None:
         self._items: deque[tuple[str, bytes]] = deque(maxlen=capacity)
         self._ready = threading.Condition()
-        self._session, self._key_expr = session, key_expr
         self.dropped = self.received = 0
-        self._subscriber = self._subscribe()
-
-    def _subscribe(self) -> Any:
-        return self._session.declare_subscriber(self._key_expr, zenoh.handlers.Callback(self._receive, indirect=False))
-
-    def renew(self) -> None:
-        """Subscribe anew, so that every neighbour hears of it again; what is sent meanwhile is lost."""
-        self._subscriber.undeclare()
-        self._subscriber = self._subscribe()
+        self._subscriber = session.declare_subscriber(key_expr, zenoh.handlers.Callback(self._receive, indirect=False))
 
     def _receive(self, sample: zenoh.Sample) -> None:
         with self._ready:
@@ -238,9 +230,9 @@ class Wire:
         """All samples of a channel in order, with a wake-up."""
         return Inbox(self.session, key(self.bench, channel))
 
-    def everything(self, capacity: int) -> Inbox:
+    def everything(self, capacity: int) -> Backlog:
         """All samples of all channels of the bench."""
-        return Inbox(self.session, f"{ROOT}/{self.bench}/**", capacity)
+        return Backlog(self.session, f"{ROOT}/{self.bench}/**", capacity)
 
     def settle(self, stop: Callable[[], bool]) -> None:
         """Return when the links to the meeting point and to the peers it tells of are up, or after a while without them.

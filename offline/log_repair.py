@@ -1,0 +1,211 @@
+"""Writing a good file from a damaged one: all that can still be read, in its order, with indexes and summary made anew."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
+
+from softloop.offline.log import DAMAGE, decompress, find_messages
+from softloop.offline.mcap_walk import RECORD, FileRecords
+from softloop.wire.errors import BadFile, Unavailable
+from softloop.wire.mcap_chunks import MAGIC, ChunkedWriter
+from softloop.wire.mcap_layout import CHUNK_BYTES, LIBRARY, PROFILE
+
+KEPT_AS = ".damaged"
+_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
+
+
+@dataclass
+class Repaired:
+    """What a repair wrote, and what it had to leave out."""
+
+    file: Path
+    messages: int = 0
+    attachments: int = 0
+    left_out: int = 0
+
+
+def repair_log(source: Path, target: Path | None = None) -> Repaired:
+    """Write what can be read of `source` into a whole file.
+
+    Args:
+        target: where to; None: in place of `source`, which is then kept beside it with `.damaged` at its end.
+
+    Raises:
+        BadFile: `source` is no MCAP file, or cannot be read.
+        Unavailable: `target` is there already, or cannot be written.
+    """
+    kept = source.with_name(source.name + KEPT_AS)
+    taken = kept if target is None else target
+    if taken.exists():
+        raise Unavailable(f"{taken}: is there already; move it away first")
+    made = (source if target is None else target).with_name((target or source).name + ".partial")
+    content = _read(source)
+    try:
+        with made.open("wb") as stream:
+            found = _rewrite(content, stream, target or source)
+            stream.flush()
+            os.fsync(stream.fileno())
+        if target is None:
+            source.rename(kept)
+        made.rename(target or source)
+    except OSError as error:
+        with suppress(OSError):
+            made.unlink()
+        raise Unavailable(f"{made}: cannot be written: {error.strerror or error}") from None
+    return found
+
+
+def _read(source: Path) -> memoryview:
+    try:
+        with source.open("rb") as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                raise BadFile(f"{source}: not an MCAP file")
+        mapped: Any = np.memmap(source, np.uint8, "r")
+    except OSError as error:
+        raise BadFile(f"{source}: cannot be read: {error.strerror or error}") from None
+    return memoryview(mapped)
+
+
+def _rewrite(content: memoryview, stream: Any, file: Path) -> Repaired:
+    described = _Descriptions()
+    _each(content, described.handlers)
+    rewriter = _Rewriter(stream, file, described)
+    rewriter.found.left_out = _each(content, rewriter.handlers) + len(rewriter.lost_channels)
+    rewriter.writer.finish()
+    return rewriter.found
+
+
+def _each(content: memoryview, handlers: dict[int, Callable[[bytes], None]]) -> int:
+    """Give every record that has a handler to it; how many places are damaged."""
+    records, damaged = FileRecords(content), 0
+    for opcode, _, body in records:
+        handler = handlers.get(opcode)
+        if handler is None:
+            continue
+        try:
+            handler(bytes(body))
+        except DAMAGE:
+            damaged += 1
+            records.damaged()
+    return damaged + len(records.skipped)
+
+
+class _Descriptions:
+    """Header, schemas and channels of a file; those in a chunk, which has a checksum, before those outside."""
+
+    def __init__(self) -> None:
+        self.header = Header(PROFILE, LIBRARY)
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.handlers: dict[int, Callable[[bytes], None]] = {
+            Opcode.HEADER: self._header,
+            Opcode.SCHEMA: self._schema,
+            Opcode.CHANNEL: self._channel,
+            Opcode.CHUNK: self._chunk,
+        }
+
+    def _header(self, body: bytes) -> None:
+        self.header = Header.read(_stream(body))
+
+    def _schema(self, body: bytes) -> None:
+        schema = Schema.read(_stream(body))
+        self.schemas.setdefault(schema.id, schema)
+
+    def _channel(self, body: bytes) -> None:
+        channel = Channel.read(_stream(body))
+        self.channels.setdefault(channel.id, channel)
+
+    def _chunk(self, body: bytes) -> None:
+        for opcode, content in _records_of_chunk(body):
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(_stream(content))
+                self.schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = Channel.read(_stream(content))
+                self.channels[channel.id] = channel
+
+
+class _Rewriter:
+    """The state of one repair. Numbers of schemas and channels are given anew."""
+
+    def __init__(self, stream: Any, file: Path, described: _Descriptions) -> None:
+        self.found = Repaired(file)
+        self.lost_channels: set[int] = set()
+        self.writer = ChunkedWriter(stream, described.header.profile, described.header.library, CHUNK_BYTES)
+        self._attached: set[str] = set()
+        self._described: set[str] = set()
+        schemas = {0: 0}
+        for number, schema in described.schemas.items():
+            schemas[number] = self.writer.add_schema(schema.name, schema.encoding, schema.data)
+        self._channels = {
+            number: self.writer.add_channel(channel.topic, channel.message_encoding, schemas[channel.schema_id])
+            for number, channel in described.channels.items()
+            if channel.schema_id in schemas
+        }
+        self.handlers: dict[int, Callable[[bytes], None]] = {
+            Opcode.CHUNK: self._chunk,
+            Opcode.MESSAGE: self._message,
+            Opcode.ATTACHMENT: self._attachment,
+            Opcode.METADATA: self._metadata,
+        }
+
+    def _attachment(self, body: bytes) -> None:
+        attachment = Attachment.read(_stream(body))
+        (crc,) = struct.unpack("<I", body[-4:])
+        if crc and zlib.crc32(body[:-4]) != crc:
+            raise ValueError("checksum differs")
+        if attachment.name not in self._attached:
+            self._attached.add(attachment.name)
+            self.writer.add_attachment(attachment.log_time, attachment.name, attachment.media_type, attachment.data)
+            self.found.attachments += 1
+
+    def _metadata(self, body: bytes) -> None:
+        metadata = Metadata.read(_stream(body))
+        if metadata.name not in self._described:
+            self._described.add(metadata.name)
+            self.writer.add_metadata(metadata.name, metadata.metadata)
+
+    def _message(self, body: bytes) -> None:
+        channel_id, sequence, log_time, _ = _MESSAGE_HEAD.unpack_from(body)
+        ours = self._channels.get(channel_id)
+        if ours is None:
+            self.lost_channels.add(channel_id)
+            return
+        self.writer.add_message(ours, log_time, sequence, body[_MESSAGE_HEAD.size :])
+        self.found.messages += 1
+
+    def _chunk(self, body: bytes) -> None:
+        for opcode, content in _records_of_chunk(body):
+            if opcode == Opcode.MESSAGE:
+                self._message(content)
+
+
+def _records_of_chunk(body: bytes) -> Iterator[tuple[int, bytes]]:
+    """Opcode and content of each record of a chunk, once all of it is known to be sound. Raises one of DAMAGE."""
+    chunk = Chunk.read(_stream(body))
+    data = decompress(chunk)
+    if len(data) != chunk.uncompressed_size or (chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc):
+        raise ValueError("checksum differs")
+    found = np.empty((len(data) // RECORD.size + 1, 4), np.int64)
+    count = find_messages(np.frombuffer(data, np.uint8), found)
+    if count < 0:
+        raise ValueError("its records do not fit its size")
+    for opcode, _, start, length in found[:count].tolist():
+        yield opcode, data[start : start + length]
+
+
+def _stream(body: bytes) -> ReadDataStream:
+    return ReadDataStream(BytesIO(body))
