@@ -50,7 +50,7 @@ class FaultConfig(Table):
     kind: Literal[
         "chamber_bias", "chamber_stuck", "analog_silent", "angle_bias", "rate_bias", "angle_stuck", "inclinometer_silent",
         "noise", "commands_lost", "driver_silent", "supply_loss", "hose_burst", "charge_stuck", "exhaust_stuck", "power_loss",
-    ] = Field(description="what breaks; see docs/faults.md")  # fmt: skip
+    ] = Field(description="what breaks; see docs/exactness.md")  # fmt: skip
     on_s: float = Field(ge=0, description="when it breaks")
     off_s: float = Field(1e9, gt=0, description="default: it stays broken")
     size: float = Field(0.0, description="bias: kPa, deg, deg/s; noise: times the own; supply_loss: part; hose_burst: mm2")
