@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
+from softloop.controller.command import COMMAND, fill_command_of_arrays
 from softloop.controller.config import ControllerConfig
 from softloop.controller.records import INPUTS, PHASE_WAIT
 from softloop.controller.setup import PERIOD_NS, Controller, build
-from softloop.wire.channels import COMMAND, CYCLE, INCLINATION, PRESSURE, VALVES
+from softloop.wire import channels
+from softloop.wire.channels import CYCLE, INCLINATION, PRESSURE, VALVES
 from softloop.wire.clock import Deadlines
 from softloop.wire.messages import BadPayload, constant, message
 from softloop.wire.shell import Context
@@ -42,10 +46,10 @@ class ControllerLoop:
         self.clock = context.clock
         pace = context.pace
         self.inputs = [self._input(pace.newest(wire.latest(c), *source), name) for c, name, source in _INPUTS]
-        self.put_command, self.put_cycle = wire.publisher(COMMAND), wire.publisher(CYCLE)
+        self.put_command, self.put_cycle = wire.publisher(channels.COMMAND), wire.publisher(CYCLE)
         self.status = StatusReporter(context, _SOURCE)
         self.events = EventReporter(context, _SOURCE)
-        self.command, self.record = message("ValveCommand"), message("CycleRecord")
+        self.kind, self.command, self.record = message("ValveCommand"), np.zeros(1, COMMAND), message("CycleRecord")
         self.phase = PHASE_WAIT
         self.woken_ns = 0
 
@@ -60,6 +64,7 @@ class ControllerLoop:
         """One tick on empty inputs, so that nothing is loaded or compiled once the loop runs; then start afresh."""
         before = self.controller.state.copy()
         self.controller.tick()
+        fill_command_of_arrays(self.controller.cycle, self.command)
         self.controller.state[:] = before
 
     def read(self, deadlines: Deadlines) -> None:
@@ -80,7 +85,8 @@ class ControllerLoop:
         cycle = self.controller.cycle[0]
         cycle.woken_ns = self.woken_ns
         cycle.computed_ns = self.clock.now_ns()
-        self.put_command(self._command(cycle))
+        fill_command_of_arrays(self.controller.cycle, self.command)
+        self.put_command(self.kind.pack_record(self.command[0]))
         cycle.published_ns = self.clock.now_ns()
         self.put_cycle(self.record.pack_record(cycle))
         if cycle.phase != self.phase:
@@ -89,23 +95,6 @@ class ControllerLoop:
         if cycle.skipped:
             self.events.say(_KIND_OVERRUN, int(cycle.stamp_ns), value=float(cycle.skipped), tick=int(cycle.tick))
         self.status.cycle(late_ns=self.woken_ns - int(cycle.stamp_ns), skipped=int(cycle.skipped))
-
-    def _command(self, cycle: Any) -> bytes:
-        return self.command.pack(
-            self.command.make(
-                seq=int(cycle.seq),
-                stamp_ns=int(cycle.computed_ns),
-                tick=int(cycle.tick),
-                pressure_stamp_ns=int(cycle.pressure_stamp_ns),
-                inclination_stamp_ns=int(cycle.inclination_stamp_ns),
-                chamber_pressure_kpa=float(cycle.chamber_pressure_kpa),
-                angle_deg=float(cycle.angle_deg),
-                charge_current_ma=float(cycle.charge_current_ma),
-                exhaust_current_ma=float(cycle.exhaust_current_ma),
-                mode=int(cycle.mode),
-                ready=int(cycle.inputs_valid),
-            )
-        )
 
     def close(self) -> None:
         """Say that this process ends."""

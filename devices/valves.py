@@ -10,8 +10,10 @@ import numpy as np
 
 from softloop.devices import gate as g
 from softloop.devices.config import PERIOD_NS, ValvesProcess
+from softloop.devices.gate_messages import COMMAND as COMMAND_DTYPE
+from softloop.devices.gate_messages import FRAME, fill_status_of_arrays, give_command_of_arrays
+from softloop.devices.gate_messages import STATUS as STATUS_DTYPE
 from softloop.devices.protocols import can_frames
-from softloop.devices.protocols.quantise import counts_to_current
 from softloop.wire.can_config import open_port
 from softloop.wire.can_port import CanPort
 from softloop.wire.channels import COMMAND, REQUEST, VALVES
@@ -62,6 +64,8 @@ class ValvesLoop:
         self.records = [np.zeros(1, d) for d in (g.GATE_CONFIG, g.GATE_STATE, g.GATE_INPUT, g.GATE_OUTPUT)]
         self.records[0][0] = g.gate_config(config)
         self.state, self.given, self.output = (record[0] for record in self.records[1:])  # views
+        self.command, self.frame, self.word = np.zeros(1, COMMAND_DTYPE), np.zeros(1, FRAME), np.zeros(1, STATUS_DTYPE)
+        self.command_bytes = self.command.view("u1")
         self.driver = can_frames.E2eReceiver(can_frames.VALVE_STATUS_ID, config.valves.driver_max_lost)
         self.driver_frame = can_frames.ValveStatusFrame(0, 0, 0, 0, 0)
         self.seq = self.tick = self.bus_offs = self.late_ns = 0
@@ -78,7 +82,10 @@ class ValvesLoop:
 
     def _warm(self) -> None:
         """Compile and load all that the loop uses, on records of its own."""
-        g.gate_step_of_arrays(self.records[0], *(record.copy() for record in self.records[1:]))
+        state, given, output = (record.copy() for record in self.records[1:])
+        g.gate_step_of_arrays(self.records[0], state, given, output)
+        give_command_of_arrays(given, self.command, 0)
+        fill_status_of_arrays(self.frame, given, state, output, self.word)
         data = can_frames.encode_valve_command(can_frames.ValveCommandFrame(0, 0, 0, 0, 0))
         can_frames.decode_valve_status(data)
 
@@ -100,16 +107,12 @@ class ValvesLoop:
         payloads = [payload, *(p for _, p in self.commands.take_all())]
         self.status.dropped += len(payloads) - 1
         try:
-            command = _COMMAND.unpack(payloads[-1])
+            _COMMAND.unpack_into(payloads[-1], self.command_bytes)
         except BadPayload:
             self.status.dropped += 1
             return False
-        given = self.given
-        given.command_new, given.command_received_ns, given.command_seq = 1, now_ns, command.seq & _INT63
-        given.pressure_stamp_ns, given.inclination_stamp_ns = command.pressure_stamp_ns, command.inclination_stamp_ns
-        given.chamber_pressure_kpa, given.angle_deg = command.chamber_pressure_kpa, command.angle_deg
-        given.charge_current_ma, given.exhaust_current_ma = command.charge_current_ma, command.exhaust_current_ma
-        given.ready, self.tick = command.ready, command.tick
+        give_command_of_arrays(self.records[2], self.command, now_ns)
+        self.tick = int(self.command["tick"][0])
         self.deadline_ns = now_ns + self.wait_ns
         self.late_ns = 0
         return True
@@ -182,26 +185,10 @@ class ValvesLoop:
             self.status.dropped += 1
 
     def _publish(self, stamp_ns: int) -> None:
-        given, output, driver = self.given, self.output, self.driver_frame
-        answered = given.command_new != 0 and given.command_seq == self.state.command_seq  # not one that was overtaken
-        status = _STATUS.make(
-            seq=self.seq,
-            stamp_ns=stamp_ns,
-            command_seq=int(given.command_seq) if answered else 0,
-            tick=self.tick,
-            command_received_ns=int(given.command_received_ns),
-            driver_stamp_ns=int(given.driver_stamp_ns),
-            charge_current_ma=float(output.charge_current_ma),
-            exhaust_current_ma=float(output.exhaust_current_ma),
-            charge_coil_ma=counts_to_current(driver.charge_counts),
-            exhaust_coil_ma=counts_to_current(driver.exhaust_counts),
-            rejected=self.driver.rejected,
-            gate=int(output.gate),
-            output=int(output.output),
-            reason=int(output.reason),
-            driver=int(output.driver),
-        )
-        self.put(_STATUS.pack(status))
+        driver = self.driver_frame
+        self.frame[0] = (self.seq, stamp_ns, self.tick, driver.charge_counts, driver.exhaust_counts, self.driver.rejected)
+        fill_status_of_arrays(self.frame, self.records[2], self.records[1], self.records[3], self.word)
+        self.put(_STATUS.pack_record(self.word[0]))
 
     def _say(self, stamp_ns: int) -> None:
         """Events of this step, and lines for a person."""

@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 from numba import types
 
+from softloop.controller.command import fill_command
 from softloop.controller.laws.arc import STEP1_TYPE
 from softloop.controller.records import CONFIG_TYPE, CYCLE_TYPE, GAINS_TYPE, INPUTS_TYPE
 from softloop.controller.records import STATE_TYPE as CONTROLLER_STATE_TYPE
 from softloop.controller.tick import SCRATCH_TYPE, controller_tick
 from softloop.devices.gate import DRIVER_OK, DRIVER_WATCHDOG, gate_step
+from softloop.devices.gate_messages import fill_status, give_command
 from softloop.devices.protocols.analog import SAMPLE
 from softloop.devices.protocols.analog_kernels import analog_step
 from softloop.devices.protocols.quantise_kernels import (
-    counts_to_current,
     counts_to_deg,
     counts_to_deg_s,
     counts_to_kpa,
@@ -142,20 +143,8 @@ def hear_driver(link: Any, between: Any, way: Any, now_ns: int) -> None:
         event = way.events[way.head]
         between.given.driver = DRIVER_OK if event.raw[2] == 0 else DRIVER_WATCHDOG
         between.given.driver_stamp_ns = event.end_ns - link.driver_frame_ns
-        between.charge_coil, between.exhaust_coil = event.raw[0], event.raw[1]
+        between.frame.charge_coil, between.frame.exhaust_coil = event.raw[0], event.raw[1]
         drop_first(way)
-
-
-@kernel(_VOID(BETWEEN_TYPE, CYCLE_TYPE, _I8))
-def hand_over(between: Any, cycle: Any, now_ns: int) -> None:
-    """The command of this tick, as the gate takes it from the wire."""
-    given = between.given
-    given.command_new, given.command_received_ns, given.command_seq = 1, now_ns, cycle.seq
-    given.pressure_stamp_ns, given.inclination_stamp_ns = cycle.pressure_stamp_ns, cycle.inclination_stamp_ns
-    given.chamber_pressure_kpa, given.angle_deg = cycle.chamber_pressure_kpa, cycle.angle_deg
-    given.charge_current_ma, given.exhaust_current_ma = cycle.charge_current_ma, cycle.exhaust_current_ma
-    given.ready = cycle.inputs_valid
-    between.tick = cycle.tick
 
 
 @kernel(_VOID(LINK_TYPE, BETWEEN_TYPE, _I8))
@@ -174,22 +163,12 @@ def hear_requests(link: Any, between: Any, now_ns: int) -> None:
 @kernel(_VOID(LINK_TYPE, BETWEEN_TYPE, _I8, STATUS_TYPE))
 def run_gate(link: Any, between: Any, now_ns: int, status: Any) -> None:
     """The process `valves`, one step: requests, judgement, and its word on the frame."""
-    given, output, state = between.given, between.output, between.gate
     hear_requests(link, between, now_ns)
-    given.now_ns = now_ns
-    gate_step(link.gate, state, given, output)
-    between.frames += 1
-    answered = given.command_new != 0 and given.command_seq == state.command_seq
-    status.seq, status.stamp_ns, status.tick = between.frames, now_ns, between.tick
-    status.command_seq = given.command_seq if answered else 0
-    status.command_received_ns, status.driver_stamp_ns = given.command_received_ns, given.driver_stamp_ns
-    status.charge_current_ma, status.exhaust_current_ma = output.charge_current_ma, output.exhaust_current_ma
-    status.charge_coil_ma, status.exhaust_coil_ma = (
-        counts_to_current(between.charge_coil),
-        counts_to_current(between.exhaust_coil),
-    )
-    status.rejected = 0
-    status.gate, status.output, status.reason, status.driver = output.gate, output.output, output.reason, output.driver
+    between.given.now_ns = now_ns
+    gate_step(link.gate, between.gate, between.given, between.output)
+    between.frame.seq += 1
+    between.frame.stamp_ns, between.frame.tick = now_ns, between.command.tick
+    fill_status(between.frame, between.given, between.gate, between.output, status)
 
 
 @kernel(_VOID(LINK_TYPE, BETWEEN_TYPE, _I8, STATUS_TYPE, _STATUSES))
@@ -199,8 +178,8 @@ def shut_gate(link: Any, between: Any, now_ns: int, status: Any, statuses: np.nd
     for k in range(SHUTDOWN_FRAMES):
         between.given.command_new = 0
         run_gate(link, between, now_ns + k * PERIOD_NS, status)
-        if between.frames <= statuses.size:
-            statuses[between.frames - 1] = status
+        if between.frame.seq <= statuses.size:
+            statuses[between.frame.seq - 1] = status
 
 
 @kernel(
@@ -231,10 +210,13 @@ def simulate(
         controller_tick(config, model, gains, knots, table, inputs, state, scratch, first, cycle)
         cycle.woken_ns, cycle.computed_ns, cycle.published_ns = now_ns, now_ns, now_ns
         sent_ns = now_ns + link.latency_ns
-        hand_over(between, cycle, sent_ns)
+        fill_command(cycle, between.command)
+        give_command(between.given, between.command, sent_ns)
         run_gate(link, between, sent_ns, inputs.valves)
         if k < statuses.size:
             statuses[k] = inputs.valves
         output, end_ns = between.output, sent_ns + link.valve_frame_ns
-        accept_command(params, plant, end_ns, output.charge_counts, output.exhaust_counts, output.output, between.frames % 65536)
+        accept_command(
+            params, plant, end_ns, output.charge_counts, output.exhaust_counts, output.output, between.frame.seq & 0xFFFF
+        )
     shut_gate(link, between, start_ns + cycles.size * PERIOD_NS + link.latency_ns, inputs.valves, statuses)

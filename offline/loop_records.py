@@ -8,6 +8,7 @@ import numpy as np
 from numba import types
 
 from softloop.devices.gate import GATE_CONFIG, GATE_INPUT, GATE_OUTPUT, GATE_STATE
+from softloop.devices.gate_messages import COMMAND, FRAME
 from softloop.devices.protocols.analog import ANALOG_CONFIG, ANALOG_STATE
 from softloop.devices.protocols.wt931 import SAMPLER_CONFIG, SAMPLER_STATE
 from softloop.plant.records import EVENT
@@ -48,11 +49,9 @@ BETWEEN = record_dtype(
         ("gate", GATE_STATE),
         ("given", GATE_INPUT),
         ("output", GATE_OUTPUT),
+        ("command", COMMAND),
+        ("frame", FRAME),
         ("inclination_seq", "i8"),
-        ("charge_coil", "i8"),  # counts of the driver's last status frame
-        ("exhaust_coil", "i8"),
-        ("frames", "i8"),  # valve frames sent
-        ("tick", "u8"),
         ("requests", "i8"),  # taken so far
         ("truths", "i8"),
         ("pressures", "i8"),
