@@ -12,7 +12,9 @@ from softloop.wire.benchfile import Table
 class ActuationConfig(Table):
     """`[controller.actuation]`: from demanded flow to working mode and currents."""
 
-    modes: Literal["table2", "flow"] = Field("flow", description="the paper's Table 2, or the sign of the demanded flow")
+    modes: Literal["table2", "flow", "latched"] = Field(
+        "flow", description="the paper's Table 2, or the demanded flow: its sign, or its sign once it is more than flow_hold_kpa_s"
+    )
     flow_hold_kpa_s: float = Field(4.0, ge=0, description="a smaller demand opens no valve")
     error_hold_deg: float = Field(0.1, ge=0, description="epsilon_0: on a dwell, hold below this error")
     error_release_deg: float = Field(0.2, ge=0, description="and leave hold above this one")

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numba import types
 
+from softloop.controller.actuation import opening_current
 from softloop.controller.flows import carried, supplied
 from softloop.controller.records import (
     CONFIG_TYPE,
@@ -70,22 +71,35 @@ def begin_observer(inputs: Any, observer: Any) -> None:
     observer.inclination_ns, observer.pressure_ns = inputs.inclination.stamp_ns, inputs.pressure.stamp_ns
 
 
+@kernel(types.b1(MODEL_TYPE, _F8, STATE_TYPE))
+def valve_open(model: Any, supply_kpa: float, state: Any) -> bool:
+    """Whether the valve whose turn it is feels more than its opening current, by model and offset."""
+    observer, theta = state.observer, state.theta
+    if state.mode == MODE_CHARGE:
+        opening = opening_current(model, theta, True, supply_kpa, observer.chamber_kpa)
+        return bool(observer.charge_play_ma - observer.charge_offset_ma > opening)
+    if state.mode == MODE_EXHAUST:
+        opening = opening_current(model, theta, False, supply_kpa, observer.chamber_kpa)
+        return bool(observer.exhaust_play_ma - observer.exhaust_offset_ma > opening)
+    return False
+
+
 @kernel(types.void(MODEL_TYPE, STATE_TYPE, _F8, _F8, _F8, _F8))
 def teach_valve(model: Any, state: Any, settled_s: float, period_s: float, supply_kpa: float, flow_kpa_s: float) -> None:
     """Give a missing flow to the valve that was open when it arose, where only one can have been."""
     observer, theta = state.observer, state.theta
     if state.mode_ticks * period_s < settled_s:
         return
-    if state.mode == MODE_CHARGE:
+    if not valve_open(model, supply_kpa, state):
+        observer.hold_kpa_s = within(observer.hold_kpa_s + flow_kpa_s, _HOLD_MAX_KPA_S)
+    elif state.mode == MODE_CHARGE:
         f1, _, _ = known_terms(model, True, supply_kpa, observer.chamber_kpa)
         step = flow_kpa_s / (theta[KV1_CHARGE] * max(f1, _FLOW_FLOOR))
         observer.charge_offset_ma = within(observer.charge_offset_ma - step, _OFFSET_MAX_MA)
-    elif state.mode == MODE_EXHAUST:
+    else:
         f1, _, _ = known_terms(model, False, supply_kpa, observer.chamber_kpa)
         step = flow_kpa_s / (theta[KV1_EXHAUST] * min(f1, -_FLOW_FLOOR))
         observer.exhaust_offset_ma = within(observer.exhaust_offset_ma - step, _OFFSET_MAX_MA)
-    else:
-        observer.hold_kpa_s = within(observer.hold_kpa_s + flow_kpa_s, _HOLD_MAX_KPA_S)
 
 
 @kernel(types.void(CONFIG_TYPE, MODEL_TYPE, OBSERVER_GAINS_TYPE, INPUTS_TYPE, STATE_TYPE, _F8))

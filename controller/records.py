@@ -27,8 +27,8 @@ LAWS = {
     "pressure": LAW_PRESSURE,
 }
 OBSERVED_LAWS = ("arc_eso", "pid_eso")  # these are given the observer's state, the others the newest samples carried on
-MODES_TABLE_2, MODES_FLOW_DEMAND = 0, 1
-MODE_RULES = {"table2": MODES_TABLE_2, "flow": MODES_FLOW_DEMAND}
+MODES_TABLE_2, MODES_FLOW_DEMAND, MODES_LATCHED = 0, 1, 2
+MODE_RULES = {"table2": MODES_TABLE_2, "flow": MODES_FLOW_DEMAND, "latched": MODES_LATCHED}
 
 CYCLE = message("CycleRecord").dtype
 # Places of `CycleRecord.internal`: the measurement that the law was given, then what the record would otherwise lack of the

@@ -12,6 +12,7 @@ from numba import types
 
 from softloop.controller.actuation import current_for_flow, opening_current
 from softloop.controller.flows import remember_flow
+from softloop.controller.observer import valve_open
 from softloop.controller.records import DEMAND_TYPE, GAINS_TYPE, MEASUREMENT_TYPE, MODE_CHARGE, MODE_HOLD, STATE_TYPE
 from softloop.dynamics.parameters import LEAK, MODEL_TYPE
 from softloop.dynamics.pneumatics import known_terms, pressure_rate
@@ -58,8 +59,8 @@ def drive_valves(gains: Any, model: Any, measurement: Any, demand: Any, state: A
     if demand.mode != MODE_HOLD:
         charging = demand.mode == MODE_CHARGE
         wanted = wanted_current(model, measurement, demand, state, charging)
-        given = min(max(wanted, 0.0), top)
-        state.saturated = wanted != given
+        given = min(max(wanted, charge if charging else exhaust), top)  # a valve that is shut waits just below its opening
+        state.saturated = wanted > top
         if charging:
             charge = current_to_feel(given, observer.charge_play_ma, g.play_ma, g.play_still_ma, state.charge_ma)
         else:
@@ -79,6 +80,6 @@ def note_flow(gains: Any, model: Any, measurement: Any, demand: Any, state: Any,
         model, state.theta, measurement.supply_kpa, measurement.chamber_kpa,
         observer.charge_play_ma - observer.charge_offset_ma, observer.exhaust_play_ma - observer.exhaust_offset_ma,
     )  # fmt: skip
-    if demand.mode == MODE_HOLD:
+    if not valve_open(model, measurement.supply_kpa, state):
         flow += observer.hold_kpa_s
     remember_flow(observer, flow, ticks)
