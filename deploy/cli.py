@@ -128,6 +128,22 @@ def same(
 
 
 @app.command()
+def tune(
+    law: Annotated[str, typer.Argument(metavar="LAW", help="pid, pid_eso, smc, arc or arc_eso.")],
+    seeds: Annotated[str, typer.Option(metavar="A:B", help="Tuning rigs; judge on others.")] = "1000:1002",
+    added_ms: Annotated[float, typer.Option(metavar="MS", min=0.0, max=150.0, help="Latency added to the rig's own.")] = 0.0,
+    evaluations: Annotated[int, typer.Option(metavar="N", min=1, help="At least so many.")] = 500,
+    search_seed: Annotated[int, typer.Option(metavar="N", min=1, help="Of the optimiser.")] = 1,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the [controller] table here.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The outcome as JSON.")] = False,
+) -> int:
+    """Search a law's gains with CMA-ES in simulated runs; the same cost and budget for every law."""
+    from softloop.deploy.tune import run_tune
+
+    return run_tune(law, seeds, added_ms, evaluations, search_seed, out, as_json=as_json)
+
+
+@app.command()
 def warm(quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False) -> int:
     """Compile every kernel once; later starts load them from the cache."""
     from softloop.deploy.prepare import warm as warm_all
