@@ -13,7 +13,8 @@ class ActuationConfig(Table):
     """`[controller.actuation]`: from demanded flow to working mode and currents."""
 
     modes: Literal["table2", "flow", "latched"] = Field(
-        "flow", description="the paper's Table 2, or the demanded flow: its sign, or its sign once it is more than flow_hold_kpa_s"
+        "flow",
+        description="the paper's Table 2, or the demanded flow: its sign, or its sign beyond flow_hold_kpa_s",
     )
     flow_hold_kpa_s: float = Field(4.0, ge=0, description="a smaller demand opens no valve")
     error_hold_deg: float = Field(0.1, ge=0, description="epsilon_0: on a dwell, hold below this error")

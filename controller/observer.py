@@ -155,7 +155,7 @@ def observe_motion(config: Any, gains: Any, inputs: Any, state: Any, base_s: flo
 
 @kernel(_F8(OBSERVER_GAINS_TYPE, OBSERVER_TYPE))
 def trust(gains: Any, observer: Any) -> float:
-    """1 while the innovation is white, 0 once its autocorrelation passes `gains.whiteness`, straight between half of it and it."""
+    """1 while the innovation is white, 0 once its autocorrelation passes `gains.whiteness`; falling from half of that on."""
     if gains.whiteness <= 0.0 or observer.innovation_power <= 0.0:
         return 1.0
     correlation = abs(observer.innovation_pair) / observer.innovation_power

@@ -13,7 +13,18 @@ from softloop.controller import references
 from softloop.controller.config import ControllerConfig
 from softloop.controller.feasibility import check_angle_plan, check_pressure_plan
 from softloop.controller.laws.arc import STEP1
-from softloop.controller.records import CONFIG, CONTROLLER_STATE, CYCLE, GAINS, INPUTS, LAW_PRESSURE, LAWS, MODE_HOLD, MODE_RULES, OBSERVED_LAWS
+from softloop.controller.records import (
+    CONFIG,
+    CONTROLLER_STATE,
+    CYCLE,
+    GAINS,
+    INPUTS,
+    LAW_PRESSURE,
+    LAWS,
+    MODE_HOLD,
+    MODE_RULES,
+    OBSERVED_LAWS,
+)
 from softloop.controller.references import Plan
 from softloop.controller.tick import SCRATCH, controller_tick_of_arrays
 from softloop.dynamics.parameters import B0, Parameters, load_parameters, model_record, shipped

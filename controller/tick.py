@@ -141,7 +141,7 @@ def reference_now(config: Any, knots: np.ndarray, table: np.ndarray, state: Any,
 @kernel(types.void(types.i8, MODEL_TYPE, MEASUREMENT_TYPE, REFERENCE_TYPE, GAINS_TYPE, STATE_TYPE, STEP1_TYPE, DEMAND_TYPE))
 def law_step(law: int, model: Any, measurement: Any, reference: Any, gains: Any, state: Any, first: Any, demand: Any) -> None:
     """The law of this run; a new law is one more line here and one file beside the others."""
-    if law == LAW_PID or law == LAW_PID_ESO:
+    if law in (LAW_PID, LAW_PID_ESO):
         pid_step(measurement, reference, gains, state, demand)
     elif law == LAW_ARC:
         arc_step(model, measurement, reference, gains, state, first, demand)

@@ -144,6 +144,21 @@ def tune(
 
 
 @app.command()
+def evaluate(
+    seeds: Annotated[str, typer.Option(metavar="A:B", help="The rigs to judge on; not those of tuning.")] = "0:20",
+    laws: Annotated[str, typer.Option(metavar="LAW,LAW", help="Default: all.")] = "",
+    only: Annotated[str, typer.Option(metavar="CONDITION", help='One condition, such as "own latency"; default: all.')] = "",
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw Figs. 6 and 7 of all laws there.")] = None,
+    confirm: Annotated[int, typer.Option(metavar="N", min=0, help="Run the first N rigs at wall pace too, all processes.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Everything as JSON, every rig.")] = False,
+) -> int:
+    """Judge every law with its tuned gains on many simulated rigs; exit code 1 where arc_eso misses a bar of its own."""
+    from softloop.deploy.evaluate import run_evaluate
+
+    return run_evaluate(seeds, laws, only, figures, confirm, as_json=as_json)
+
+
+@app.command()
 def warm(quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False) -> int:
     """Compile every kernel once; later starts load them from the cache."""
     from softloop.deploy.prepare import warm as warm_all

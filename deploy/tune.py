@@ -25,7 +25,9 @@ def seeds_of(text: str) -> tuple[int, ...]:
     return tuple(seeds)
 
 
-def run_tune(law: str, seeds: str, added_ms: float, evaluations: int, search_seed: int, out: Path | None, *, as_json: bool) -> int:
+def run_tune(
+    law: str, seeds: str, added_ms: float, evaluations: int, search_seed: int, out: Path | None, *, as_json: bool
+) -> int:
     """Search, write the gains to `out` (or print them). Raises BadConfig."""
     if law not in RANGES:
         raise BadConfig(f"law '{law}' cannot be tuned; these can: {', '.join(RANGES)}")

@@ -47,12 +47,13 @@ class Trial:
     left_recovery_s: float = 0.0
 
 
+# From the plant's start to the first tick, about: when a load did come and go is then found by the truth's own flag.
+_SETTLE_S = 0.2
+
+
 def lead_s(controller: ControllerConfig) -> float:
-    """From the plant's start to the trajectory's first point in a simulated run with no load: found, not assumed."""
-    return controller.approach_s + SETTLE_S
-
-
-SETTLE_S = 0.2  # the rig's settling before the first tick in `closed_loop`; loads are found again by the truth's own flag
+    """From the plant's start to the trajectory's first point in a simulated run, about."""
+    return controller.approach_s + _SETTLE_S
 
 
 def run_trial(controller: ControllerConfig, plant: PlantConfig, *, payload: bool = False) -> Trial:

@@ -134,9 +134,7 @@ def second_step(model: Any, gains: Any, state: Any, measurement: Any, first: Any
         MODEL_TYPE, MEASUREMENT_TYPE, REFERENCE_TYPE, ACTUATION_TYPE, ARC_GAINS_TYPE, STATE_TYPE, STEP1_TYPE, DEMAND_TYPE
     )
 )  # fmt: skip
-def backstep(
-    model: Any, measurement: Any, reference: Any, actuation: Any, g: Any, state: Any, first: Any, demand: Any
-) -> None:
+def backstep(model: Any, measurement: Any, reference: Any, actuation: Any, g: Any, state: Any, first: Any, demand: Any) -> None:
     """Both steps with the gains `g`; moves the estimates where `measurement.adapt` is set. `first` is scratch."""
     theta = state.theta
     first_step(model, g, theta, state.arc.phi, measurement, reference, first)

@@ -2,8 +2,8 @@
 
 The steps are those of C3 (Eqs. 33 to 48). What differs: Delta_1 is not bounded but estimated (sigma, from the gyro), and
 compensated in P_vda; Delta_2 is estimated per valve and compensated where flow becomes current (`valve_drive`); so both steps
-need feedback for what the estimates still lack, and no more. Adaptation, where it is switched on, is composite: it is driven by the observer's residual of
-Eq. 2, sigma itself, filtered as the observer filters, and its rate is cancelled in P_vd' as C3's is.
+need feedback for what the estimates still lack, and no more. Adaptation, where it is switched on, is composite: it is driven
+by the observer's residual of Eq. 2, sigma itself, and its rate is cancelled in P_vd' as C3's is.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from numba import types
 
 from softloop.controller.actuation import choose_mode
+from softloop.controller.laws.arc import STEP1_TYPE
 from softloop.controller.records import (
     ARC_ESO_GAINS_TYPE,
     DEMAND_TYPE,
@@ -22,7 +23,6 @@ from softloop.controller.records import (
     REFERENCE_TYPE,
     STATE_TYPE,
 )
-from softloop.controller.laws.arc import STEP1_TYPE
 from softloop.controller.robust import adapted, projected_rate
 from softloop.dynamics.bending import bending_drift, drift_slope_angle, drift_slope_rate, fill_phi_a
 from softloop.dynamics.parameters import B0, MODEL_TYPE, THETA_TYPE

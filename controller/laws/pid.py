@@ -21,7 +21,7 @@ from softloop.wire.kernel import kernel
 
 @kernel(types.void(MEASUREMENT_TYPE, REFERENCE_TYPE, GAINS_TYPE, STATE_TYPE, DEMAND_TYPE))
 def pid_step(measurement: Any, reference: Any, gains: Any, state: Any, demand: Any) -> None:
-    """One step of C1, or of the equipped PID where the measurement holds a disturbance; fills `demand`, advances the integral unless the valves are saturated."""
+    """One step of C1, or of the equipped PID; fills `demand`, advances the integral unless the valves are saturated."""
     g, memory = gains.pid, state.pid
     error = measurement.angle_deg - reference.value
     error_rate = measurement.rate_deg_s - reference.rate
