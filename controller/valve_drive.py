@@ -52,8 +52,9 @@ def drive_valves(gains: Any, model: Any, measurement: Any, demand: Any, state: A
     """Set both currents in `state`; `state.saturated` says that the valve cannot give what is asked."""
     settings, observer, g = gains.actuation, state.observer, gains.observer
     supply, chamber, top = measurement.supply_kpa, measurement.chamber_kpa, settings.current_max_ma
-    charge = opening_current(model, state.theta, True, supply, chamber) + observer.charge_offset_ma
-    exhaust = opening_current(model, state.theta, False, supply, chamber) + observer.exhaust_offset_ma
+    # The valve that waits believes an offset only where it opens earlier: what was learned wrongly must not crack it open.
+    charge = opening_current(model, state.theta, True, supply, chamber) + min(observer.charge_offset_ma, 0.0)
+    exhaust = opening_current(model, state.theta, False, supply, chamber) + min(observer.exhaust_offset_ma, 0.0)
     charge, exhaust = settings.bias_fraction * charge, settings.bias_fraction * exhaust
     state.saturated = 0
     if demand.mode != MODE_HOLD:

@@ -90,7 +90,7 @@ def _kept(verdicts: Sequence[Verdict]) -> bool:
 
 def latency_budget(law: str, seed: int) -> dict[str, float]:
     """Median ages at the tick, and from the tick to the driver, in ms, in one T1 run at the rig's own latency."""
-    controller = tuned(law)
+    controller, _ = tuned(law)
     run = simulate_run(controller, PlantConfig(seed=seed))
     cycles, truths = run.cycles[200:], run.truths[200:]
     answered = truths["command_applied_ns"] - np.roll(cycles["stamp_ns"], 1)
@@ -104,25 +104,22 @@ def latency_budget(law: str, seed: int) -> dict[str, float]:
 
 def show(verdicts: Sequence[Verdict], latency: dict[str, float], confirmed: list[dict[str, Any]]) -> None:
     """One table per condition: the worst rig's figure, and the median's."""
-    console = Console(width=150)
-    console.print(
-        "latency budget: " + ", ".join(f"{k.removesuffix('_ms').replace('_', ' ')} {v:.2f} ms" for k, v in latency.items())
-    )
+    console = Console(width=190)
+    hops = ", ".join(f"{name.removesuffix('_ms').replace('_', ' ')} {value:.2f} ms" for name, value in latency.items())
+    console.print(f"latency budget: {hops}")
     for condition in dict.fromkeys(v.condition for v in verdicts):
-        table = Table(
-            title=f"{condition}: worst (median) of the rigs; deg, deg, deg, deg, s, deg, 1/s, 1/s, mA/s", title_justify="left"
-        )
+        title = f"{condition}: worst (median) of the rigs; deg, deg, deg, deg, s, deg, 1/s, 1/s, mA/s"
+        table = Table(title=title, title_justify="left")
         table.add_column("law")
         for head in (*_COLUMNS, "bars", "payload", "paper"):
             table.add_column(head, justify="right")
         for verdict in (v for v in verdicts if v.condition == condition):
-            table.add_row(verdict.law, *_row(verdict))
+            table.add_row(f"{verdict.law}, tuned at +{verdict.tuned_at_ms:g} ms", *_row(verdict))
         console.print(table)
-    console.print(
-        f"bars: T1 {BARS_DEG['t1']:g}, steady {BARS_DEG['steady']:g}, T2 {BARS_DEG['t2']:g} deg; payload: peak {BARS_DEG['peak']:g} "
-        f"deg, back under 0.5 deg in {RECOVERY_S:g} s; paper: {', '.join(f'{n} {v:g}' for n, v in PAPER_DEG.items())} deg; "
-        f"at most {SWITCHES_PER_S:g} switches per second on dwells"
-    )
+    paper = ", ".join(f"{name} {bound:g}" for name, bound in PAPER_DEG.items())
+    bars = ", ".join(f"{name} {bar:g}" for name, bar in BARS_DEG.items())
+    console.print(f"bars, deg: {bars}; back under 0.5 deg in {RECOVERY_S:g} s; {SWITCHES_PER_S:g} switches per second on dwells")
+    console.print(f"the paper's ARC, deg: {paper}")
     for run in confirmed:
         console.print(f"wall pace: {run}")
 
@@ -138,7 +135,7 @@ def draw(laws: Sequence[str], seed: int, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for trajectory, name in (("t1", "fig6_all_laws.png"), ("t2", "fig7_all_laws.png")):
         runs = {
-            law: simulate_run(tuned(law).model_copy(update={"trajectory": trajectory}), PlantConfig(seed=seed)) for law in laws
+            law: simulate_run(tuned(law)[0].model_copy(update={"trajectory": trajectory}), PlantConfig(seed=seed)) for law in laws
         }
         save(side_by_side(runs, f"{trajectory.upper()} on rig {seed}, every law with its tuned gains"), folder / name)
 
@@ -155,7 +152,7 @@ def confirm_runs(laws: Sequence[str], seeds: Sequence[int]) -> list[dict[str, An
 
 def _run_at_wall_pace(law: str, seed: int, trajectory: str) -> dict[str, Any]:
     content = tomlkit.parse(find_bench(Path("sim")).read_text())
-    content["plant"]["seed"] = seed  # type: ignore[index]
+    content["plant"]["seed"] = seed
     content["controller"] = {**read_toml(tuned_file(law))["controller"], "trajectory": trajectory}
     with tempfile.TemporaryDirectory(prefix="softloop-") as folder:
         bench, run_dir = Path(folder) / "bench.toml", Path(folder) / "run"
@@ -164,5 +161,5 @@ def _run_at_wall_pace(law: str, seed: int, trajectory: str) -> dict[str, Any]:
         code = subprocess.run(command, check=False).returncode
         path = run_dir / "summary.json"
         summary = json.loads(path.read_text()) if path.is_file() else {}
-    names = ("truth_error_max_deg", "truth_error_steady_deg", "valid_evidence")
+    names = ("truth_error_max_deg", "truth_error_steady_deg", "evidence_valid")
     return {"exit_code": code, **{name: summary.get(name) for name in names}}

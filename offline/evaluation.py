@@ -69,14 +69,18 @@ def tuned_file(law: str, added_ms: float = 0.0) -> Path:
     return Path(str(resources.files("softloop.controller") / "data" / "tuned" / f"{law}{suffix}.toml"))
 
 
-def tuned(law: str, added_ms: float = 0.0) -> ControllerConfig:
-    """The tuned [controller] of a law. Raises BadFile where there is none for this latency, BadConfig where it is wrong."""
-    path = tuned_file(law, added_ms)
+def tuned(law: str, added_ms: float = 0.0) -> tuple[ControllerConfig, float]:
+    """The tuned [controller] of a law, and the added latency that it was tuned at.
+
+    Where a latency has no gains of its own, those of the rig's own latency, told of the added delay. Raises BadFile or BadConfig.
+    """
+    path, at_ms = tuned_file(law, added_ms), added_ms
     if not path.is_file():
-        raise BadFile(
-            f"{law} has no gains tuned at {added_ms:g} ms more; make them with: softloop tune {law} --added-ms {added_ms:g}"
-        )
-    return load_model(ControllerConfig, read_toml(path)["controller"], path)
+        path, at_ms = tuned_file(law), 0.0
+    if not path.is_file():
+        raise BadFile(f"{law} has no tuned gains; make them with: softloop tune {law} --out FILE")
+    found = load_model(ControllerConfig, read_toml(path)["controller"], path)
+    return Latency(added_ms - at_ms).controller(found), at_ms
 
 
 @dataclass(frozen=True)
@@ -175,10 +179,8 @@ class Verdict:
 def evaluate(
     laws: Sequence[str], conditions: Sequence[Condition], seeds: Sequence[int], progress: Progress | None = None
 ) -> list[Verdict]:
-    """Every law under every condition for which it has gains; with those of its latency. Raises BadFile or BadConfig."""
-    jobs = [(c, law) for c in conditions for law in laws if tuned_file(law, c.added_ms).is_file()]
-    if not jobs:
-        raise BadFile(f"no gains are tuned for {', '.join(laws)} under these conditions; see softloop tune")
+    """Every law under every condition, with its gains for the condition's latency. Raises BadFile or BadConfig."""
+    jobs = [(condition, law, *tuned(law, condition.added_ms)) for condition in conditions for law in laws]
     done, verdicts = 0, []
 
     def one_more() -> None:
@@ -187,7 +189,6 @@ def evaluate(
         if progress is not None:
             progress(done, len(jobs) * len(seeds))
 
-    for condition, law in jobs:
-        judged = judge_law(tuned(law, condition.added_ms), condition, seeds, one_more)
-        verdicts.append(Verdict(law, condition.name, condition.added_ms, judged))
+    for condition, law, controller, at_ms in jobs:
+        verdicts.append(Verdict(law, condition.name, at_ms, judge_law(controller, condition, seeds, one_more)))
     return verdicts

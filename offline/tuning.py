@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from math import exp
 from typing import Any
 
-import cma
+import cma  # type: ignore[import-untyped]
 import numpy as np
 from pydantic import ValidationError
 
