@@ -219,6 +219,7 @@ def record_thoughts(config: Any, measurement: Any, reference: Any, demand: Any, 
     cycle.internal[IN_APPROACH_START] = state.approach[0]
     cycle.internal[IN_CHARGE_BEFORE_MA], cycle.internal[IN_EXHAUST_BEFORE_MA] = state.charge_before_ma, state.exhaust_before_ma
     record_observer(state.observer, cycle)
+    cycle.observing, cycle.trusted = config.observe, measurement.trust >= 1.0
     cycle.phase, cycle.mode = state.phase, state.mode
     cycle.inputs_valid, cycle.saturated, cycle.adapting = valid, state.saturated, measurement.adapt
 
