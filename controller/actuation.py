@@ -14,6 +14,7 @@ from softloop.controller.records import (
     MODE_CHARGE,
     MODE_EXHAUST,
     MODE_HOLD,
+    MODES_LATCHED,
     MODES_TABLE_2,
     REFERENCE_TYPE,
     STATE_TYPE,
@@ -57,11 +58,26 @@ def flow_mode(settings: Any, reference: Any, error: float, flow_kpa_s: float, mo
     return MODE_HOLD
 
 
+@kernel(types.i8(ACTUATION_TYPE, _F8, types.i8))
+def latched_mode(settings: Any, flow_kpa_s: float, mode: int) -> int:
+    """A valve keeps its turn, shut if need be, until the other way is asked for by more than `flow_hold_kpa_s`.
+
+    On a dwell the leak then does the exhausting, and the charge valve alone holds the pressure, with no switch.
+    """
+    if flow_kpa_s > (-settings.flow_hold_kpa_s if mode == MODE_CHARGE else settings.flow_hold_kpa_s):
+        return MODE_CHARGE
+    if flow_kpa_s < (settings.flow_hold_kpa_s if mode == MODE_EXHAUST else -settings.flow_hold_kpa_s):
+        return MODE_EXHAUST
+    return mode
+
+
 @kernel(types.i8(ACTUATION_TYPE, REFERENCE_TYPE, _F8, _F8, STATE_TYPE))
 def choose_mode(settings: Any, reference: Any, error: float, flow_kpa_s: float, state: Any) -> int:
     """The working mode of this tick; a mode once taken stays for `switch_ticks`. Updates `state.mode`."""
     if settings.rule == MODES_TABLE_2:
         wanted = table_2_mode(settings, reference, error, state.mode)
+    elif settings.rule == MODES_LATCHED:
+        wanted = latched_mode(settings, flow_kpa_s, state.mode)
     else:
         wanted = flow_mode(settings, reference, error, flow_kpa_s, state.mode)
     state.mode_ticks += 1

@@ -12,7 +12,10 @@ from softloop.wire.benchfile import Table
 class ActuationConfig(Table):
     """`[controller.actuation]`: from demanded flow to working mode and currents."""
 
-    modes: Literal["table2", "flow"] = Field("flow", description="the paper's Table 2, or the sign of the demanded flow")
+    modes: Literal["table2", "flow", "latched"] = Field(
+        "flow",
+        description="the paper's Table 2, or the demanded flow: its sign, or its sign beyond flow_hold_kpa_s",
+    )
     flow_hold_kpa_s: float = Field(4.0, ge=0, description="a smaller demand opens no valve")
     error_hold_deg: float = Field(0.1, ge=0, description="epsilon_0: on a dwell, hold below this error")
     error_release_deg: float = Field(0.2, ge=0, description="and leave hold above this one")
@@ -51,6 +54,45 @@ class ArcConfig(Table):
     desired_max_kpa: float = Field(150.0, gt=0, description="the law asks for no higher chamber pressure")
 
 
+class SmcConfig(Table):
+    """`[controller.smc]`: C2, the law of [controller.arc] without adaptation."""
+
+    k_s: float = Field(15.0, gt=0, description="K_S1, 1/s")
+    k1: float = Field(30.0, gt=0, description="K_1, 1/s")
+    k2: float = Field(50.0, gt=0, description="K_2, 1/s")
+    rho: float = Field(10.0, gt=0, description="weight of S2 in V2; 1 is the paper's text")
+    epsilon1: float = Field(5.0e4, gt=0, description="(deg/s)^2/s, Eq. 38")
+    epsilon2: float = Field(1.0e5, gt=0, description="kPa^2/s, Eq. 47")
+    delta1: float = Field(100.0, ge=0, description="bound of Delta_1, deg/s2")
+    delta2: float = Field(60.0, ge=0, description="bound of Delta_2, kPa/s")
+    desired_max_kpa: float = Field(150.0, gt=0, description="the law asks for no higher chamber pressure")
+
+
+class ArcEsoConfig(Table):
+    """`[controller.arc_eso]`: weighted backstepping on the observer's state."""
+
+    k_s: float = Field(15.0, gt=0, description="K_S1, 1/s")
+    k1: float = Field(30.0, gt=0, description="K_1, 1/s")
+    k2: float = Field(50.0, gt=0, description="K_2, 1/s")
+    rho: float = Field(10.0, gt=0, description="weight of S2 in V2")
+    gamma: float = Field(0.0, ge=0, description="composite adaptation by the residual, times theta_M^2; 0: none")
+    rate_limit: float = Field(0.5, gt=0, description="an estimate moves at most this part of its range in 1 s")
+    cautious: float = Field(0.5, gt=0, le=1, description="part of k1 and k2 that is left where the trust gate is shut")
+    desired_max_kpa: float = Field(150.0, gt=0, description="the law asks for no higher chamber pressure")
+
+
+class ObserverConfig(Table):
+    """`[controller.observer]`: of the laws arc_eso and pid_eso."""
+
+    rate_1_s: float = Field(60.0, gt=0, description="bandwidth of rate and disturbance, from the gyro")
+    angle_1_s: float = Field(8.0, gt=0, description="bandwidth of angle and gyro bias, from the angle")
+    pressure_1_s: float = Field(50.0, gt=0, description="bandwidth of pressure and the valves' offsets")
+    line_ms: float = Field(3.0, ge=0, le=50, description="the chamber's pressure trails the sensor's by this")
+    play_ma: float = Field(8.0, ge=0, le=30, description="half the width of the valves' hysteresis that is undone")
+    play_still_ma: float = Field(0.5, ge=0, description="a smaller change of the wanted current does not turn the play round")
+    whiteness: float = Field(0.0, ge=0, le=1, description="trust gate: autocorrelation of the innovation that shuts it; 0: none")
+
+
 class PressureConfig(Table):
     """`[controller.pressure]`: step 2 alone."""
 
@@ -62,7 +104,9 @@ class PressureConfig(Table):
 class ControllerConfig(Table):
     """`[controller]`: the law, its trajectory, and what it is told of delays and budgets."""
 
-    law: Literal["pid", "arc", "pressure"] = Field("arc", description="C1, C3, or step 2 of C3 alone; each has its table below")
+    law: Literal["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure"] = Field(
+        "arc", description="C1, C1 with our observer, C2, C3, ours, or step 2 of C3 alone; each has its table below"
+    )
     parameters: str = Field("table1", description="a shipped parameter set, or the path of a parameter file")
     trajectory: str = Field("t1", description="t1, t2, excitation_1hz, excitation_05hz, or the path of a CSV file t_s, value")
     trajectory_seed: int = Field(1, ge=0, le=2**32 - 1, description="phases of the multi-sines")
@@ -75,5 +119,8 @@ class ControllerConfig(Table):
     inclination_budget_ms: float = Field(30.0, gt=0, description="an older inclination is not valid")
     actuation: ActuationConfig = ActuationConfig()
     pid: PidConfig = PidConfig()
+    smc: SmcConfig = SmcConfig()
     arc: ArcConfig = ArcConfig()
+    arc_eso: ArcEsoConfig = ArcEsoConfig()
+    observer: ObserverConfig = ObserverConfig()
     pressure: PressureConfig = PressureConfig()

@@ -62,14 +62,21 @@ def _carry_on(config: Any, model: Any, inputs: Any, state: Any, measurement: Any
     measurement.chamber_kpa = chamber
 
 
-@kernel(types.void(CONFIG_TYPE, MODEL_TYPE, INPUTS_TYPE, STATE_TYPE, MEASUREMENT_TYPE))
-def measure(config: Any, model: Any, inputs: Any, state: Any, measurement: Any) -> None:
-    """Fill `measurement` from the newest samples, carried on to the time of action where `config.predict` is set."""
+@kernel(types.void(CONFIG_TYPE, INPUTS_TYPE, STATE_TYPE, MEASUREMENT_TYPE))
+def read_samples(config: Any, inputs: Any, state: Any, measurement: Any) -> None:
+    """Fill `measurement` with the newest samples as they are."""
     measurement.angle_deg = inputs.inclination.angle_deg
     measurement.rate_deg_s = inputs.inclination.rate_deg_s
     measurement.chamber_kpa = inputs.pressure.chamber_pressure_kpa
     measurement.supply_kpa = inputs.pressure.supply_pressure_kpa
     elapsed_ns = inputs.now_ns - state.last_ns
     measurement.period_s = 1e-9 * (elapsed_ns if state.last_ns > 0 else config.period_ns)
+    measurement.disturbance_deg_s2, measurement.trust = 0.0, 1.0
+
+
+@kernel(types.void(CONFIG_TYPE, MODEL_TYPE, INPUTS_TYPE, STATE_TYPE, MEASUREMENT_TYPE))
+def measure(config: Any, model: Any, inputs: Any, state: Any, measurement: Any) -> None:
+    """Fill `measurement` from the newest samples, carried on to the time of action where `config.predict` is set."""
+    read_samples(config, inputs, state, measurement)
     if config.predict:
         _carry_on(config, model, inputs, state, measurement)

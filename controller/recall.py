@@ -14,11 +14,16 @@ from numba import types
 from softloop.controller.records import (
     CONFIG_TYPE,
     CYCLE_TYPE,
+    EST_FLOWS,
+    EST_INCLINATION_NS,
+    EST_PRESSURE_NS,
     IN_APPROACH_START,
     IN_CHARGE_BEFORE_MA,
     IN_EXHAUST_BEFORE_MA,
     IN_INTEGRAL_KPA,
     IN_MODE_TICKS,
+    N_FLOWS,
+    OBSERVER_TYPE,
     PHASE_APPROACH,
     PHASE_DONE,
     PHASE_TRACK,
@@ -46,10 +51,26 @@ def recall_course(config: Any, knots: np.ndarray, table: np.ndarray, cycle: Any,
         move_between(state.approach[0], scratch.end, 1e-9 * config.approach_ns, state.approach)
 
 
+@kernel(types.void(CYCLE_TYPE, OBSERVER_TYPE))
+def recall_observer(cycle: Any, observer: Any) -> None:
+    """Set `observer` from what `record_observer` wrote. Ages in ns are exact in a float64 up to 100 days."""
+    e = cycle.estimator
+    observer.angle_deg, observer.rate_deg_s, observer.disturbance_deg_s2 = e[0], e[1], e[2]
+    observer.gyro_bias_deg_s, observer.chamber_kpa, observer.charge_offset_ma = e[3], e[4], e[5]
+    observer.exhaust_offset_ma, observer.hold_kpa_s, observer.charge_play_ma = e[6], e[7], e[8]
+    observer.exhaust_play_ma, observer.innovation_deg_s, observer.innovation_power = e[9], e[10], e[11]
+    observer.innovation_pair = e[12]
+    observer.inclination_ns = cycle.stamp_ns - int(e[EST_INCLINATION_NS])
+    observer.pressure_ns = cycle.stamp_ns - int(e[EST_PRESSURE_NS])
+    for j in range(N_FLOWS):
+        observer.flow_kpa_s[j] = e[EST_FLOWS + j]
+
+
 @kernel(types.void(CONFIG_TYPE, array_of(_F8), array_of(_F8, 2), CYCLE_TYPE, STATE_TYPE, SCRATCH_TYPE))
 def recall(config: Any, knots: np.ndarray, table: np.ndarray, cycle: Any, state: Any, scratch: Any) -> None:
     """Set `state` to what it was after the tick that left `cycle`, as far as any later tick can tell."""
     recall_course(config, knots, table, cycle, state, scratch)
+    recall_observer(cycle, state.observer)
     for i in range(state.theta.size):
         state.theta[i] = cycle.theta[i]
     state.charge_ma, state.exhaust_ma = cycle.charge_current_ma, cycle.exhaust_current_ma

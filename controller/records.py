@@ -17,16 +17,28 @@ GATE_ARMED = constant("ValveStatus", "GATE_ARMED")
 OUTPUT_PASS = constant("ValveStatus", "OUTPUT_PASS")
 SAMPLE_OK = constant("PressureSample", "STATUS_OK")
 
-LAW_PID, LAW_ARC, LAW_PRESSURE = 0, 1, 2
-LAWS = {"pid": LAW_PID, "arc": LAW_ARC, "pressure": LAW_PRESSURE}
-MODES_TABLE_2, MODES_FLOW_DEMAND = 0, 1
-MODE_RULES = {"table2": MODES_TABLE_2, "flow": MODES_FLOW_DEMAND}
+LAW_PID, LAW_ARC, LAW_PRESSURE, LAW_SMC, LAW_ARC_ESO, LAW_PID_ESO = 0, 1, 2, 3, 4, 5
+LAWS = {
+    "pid": LAW_PID,
+    "pid_eso": LAW_PID_ESO,
+    "smc": LAW_SMC,
+    "arc": LAW_ARC,
+    "arc_eso": LAW_ARC_ESO,
+    "pressure": LAW_PRESSURE,
+}
+OBSERVED_LAWS = ("arc_eso", "pid_eso")  # these are given the observer's state, the others the newest samples carried on
+MODES_TABLE_2, MODES_FLOW_DEMAND, MODES_LATCHED = 0, 1, 2
+MODE_RULES = {"table2": MODES_TABLE_2, "flow": MODES_FLOW_DEMAND, "latched": MODES_LATCHED}
 
 CYCLE = message("CycleRecord").dtype
 # Places of `CycleRecord.internal`: the measurement that the law was given, then what the record would otherwise lack of the
 # state after the tick (`recall` reads it back).
 IN_CHAMBER_KPA, IN_SUPPLY_KPA, IN_PERIOD_S, IN_INTEGRAL_KPA, IN_MODE_TICKS = 0, 1, 2, 3, 4
 IN_APPROACH_START, IN_CHARGE_BEFORE_MA, IN_EXHAUST_BEFORE_MA = 5, 6, 7
+# Places of `CycleRecord.estimator`: the observer's scalars in the order of `OBSERVER_SCALARS`, how long before the tick it stands
+# (ns, inclination and pressure), and from EST_FLOWS on its flows, newest first.
+N_FLOWS = 32  # ticks of commands under way: 160 ms of delay and age together
+EST_INCLINATION_NS, EST_PRESSURE_NS, EST_FLOWS = 14, 15, 16
 
 # What lay on the inputs when the tick began: the newest message of each channel, whole.
 INPUTS = record_dtype(
@@ -48,6 +60,8 @@ MEASUREMENT = record_dtype(
         ("chamber_kpa", "f8"),
         ("supply_kpa", "f8"),
         ("period_s", "f8"),  # since the last tick, skipped ones included
+        ("disturbance_deg_s2", "f8"),  # what the observer adds to Eq. 2; 0 without an observer
+        ("trust", "f8"),  # of the observer's model, 0 to 1; 1 without a trust gate
         ("adapt", "u1"),  # 1 where inputs are fresh and the last command was not saturated
     ]
 )
@@ -91,11 +105,64 @@ ARC_GAINS = record_dtype(
         ("rate_limit", "f8", (N_THETA,)),
     ]
 )
+ARC_ESO_GAINS = record_dtype(
+    [
+        *[(n, "f8") for n in ("k_s", "k1", "k2", "rho", "desired_max_kpa", "cautious")],
+        ("gamma", "f8", (N_THETA,)),  # composite adaptation by the observer's residual
+        ("rate_limit", "f8", (N_THETA,)),
+    ]
+)
+OBSERVER_GAINS = record_dtype(
+    [
+        ("rate_1_s", "f8"),  # bandwidths
+        ("angle_1_s", "f8"),
+        ("pressure_1_s", "f8"),
+        ("line_s", "f8"),  # the chamber's pressure trails the sensor's block by this
+        ("play_ma", "f8"),  # half width of the valves' hysteresis that is compensated
+        ("play_still_ma", "f8"),  # a smaller change of the wanted current does not turn the play round
+        ("whiteness", "f8"),  # |autocorrelation| of the innovation from which the model is not trusted; 0: always trusted
+    ]
+)
 PRESSURE_GAINS = record_dtype([(n, "f8") for n in ("k2", "epsilon2", "delta2")])
-GAINS = record_dtype([("actuation", ACTUATION), ("pid", PID_GAINS), ("arc", ARC_GAINS), ("pressure", PRESSURE_GAINS)])
+GAINS = record_dtype(
+    [
+        ("actuation", ACTUATION),
+        ("pid", PID_GAINS),
+        ("arc", ARC_GAINS),
+        ("pressure", PRESSURE_GAINS),
+        ("smc", ARC_GAINS),
+        ("arc_eso", ARC_ESO_GAINS),
+        ("observer", OBSERVER_GAINS),
+    ]
+)
 
 PID_STATE = record_dtype([("integral_kpa", "f8")])
 ARC_STATE = record_dtype([("phi", "f8", (N_THETA,)), ("tau", "f8", (N_THETA,))])
+# What the observer knows: the mechanics at the inclinometer's newest stamp, the pressure at that of the pressure's, what the
+# valves do that their model does not say, and the flows (kPa/s) of the commands under way, newest first.
+OBSERVER_SCALARS = (
+    "angle_deg",
+    "rate_deg_s",
+    "disturbance_deg_s2",
+    "gyro_bias_deg_s",
+    "chamber_kpa",
+    "charge_offset_ma",  # by which a valve opens later than its model says
+    "exhaust_offset_ma",
+    "hold_kpa_s",  # pressure rate with both valves shut, beyond the model's
+    "charge_play_ma",  # currents as the spools feel them, behind their hysteresis
+    "exhaust_play_ma",
+    "innovation_deg_s",  # gyro less observer, at the newest sample
+    "innovation_power",  # running mean of its square, and of its product with the one before
+    "innovation_pair",
+)
+OBSERVER_STATE = record_dtype(
+    [
+        *[(n, "f8") for n in OBSERVER_SCALARS],
+        ("flow_kpa_s", "f8", (N_FLOWS,)),
+        ("inclination_ns", "i8"),  # stamps of the samples up to which it has been brought
+        ("pressure_ns", "i8"),
+    ]
+)
 CONTROLLER_STATE = record_dtype(
     [
         ("theta", "f8", (N_THETA,)),
@@ -112,6 +179,7 @@ CONTROLLER_STATE = record_dtype(
         ("mode_ticks", "i8"),
         ("pid", PID_STATE),
         ("arc", ARC_STATE),
+        ("observer", OBSERVER_STATE),  # before the bytes: nested records must stay aligned
         ("phase", "u1"),
         ("mode", "u1"),
         ("saturated", "u1"),
@@ -132,6 +200,7 @@ CONFIG = record_dtype(
         ("inclination_delay_ns", "i8"),
         ("actuation_delay_ns", "i8"),  # from tick to valve opening
         ("predict", "u1"),
+        ("observe", "u1"),  # the law is given the observer's state
     ]
 )
 
@@ -144,6 +213,9 @@ GAINS_TYPE = record_type(GAINS)
 PID_GAINS_TYPE = record_type(PID_GAINS)
 ARC_GAINS_TYPE = record_type(ARC_GAINS)
 PRESSURE_GAINS_TYPE = record_type(PRESSURE_GAINS)
+ARC_ESO_GAINS_TYPE = record_type(ARC_ESO_GAINS)
+OBSERVER_GAINS_TYPE = record_type(OBSERVER_GAINS)
+OBSERVER_TYPE = record_type(OBSERVER_STATE)
 PID_STATE_TYPE = record_type(PID_STATE)
 ARC_STATE_TYPE = record_type(ARC_STATE)
 STATE_TYPE = record_type(CONTROLLER_STATE)

@@ -64,7 +64,9 @@ class Plan:
 
     def sample(self, times_s: Floats) -> Floats:
         """Value, rate, acceleration and jerk at each time, shape (n, 4)."""
-        return np.array([list(self.at(t).tolist()) for t in times_s])
+        found = np.empty((len(times_s), 4))
+        sample_plan(self.kind, self.knots, self.table, np.ascontiguousarray(times_s, np.float64), new_record(REFERENCE), found)
+        return found
 
 
 @kernel(types.void(array_of(_F8, 1, "A"), _F8, REFERENCE_TYPE))
@@ -110,6 +112,14 @@ def reference_at(kind: int, knots: Floats, table: Floats, time_s: float, point: 
     after = int(np.searchsorted(knots, time_s, side="right"))
     stretch = min(max(after - 1, 0), table.shape[0] - 1)
     polynomial_at(table[stretch], time_s - knots[stretch], point)
+
+
+@kernel(types.void(types.i8, array_of(_F8), array_of(_F8, 2), array_of(_F8), REFERENCE_TYPE, array_of(_F8, 2)))
+def sample_plan(kind: int, knots: Floats, table: Floats, times_s: Floats, point: Any, found: Floats) -> None:
+    """Value, rate, acceleration and jerk at each time into `found`, (n, 4); `point` is scratch."""
+    for k in range(times_s.size):
+        reference_at(kind, knots, table, times_s[k], point)
+        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = point.value, point.rate, point.acceleration, point.jerk
 
 
 def smooth_move(start: Floats, end: Floats, seconds: float) -> Floats:

@@ -13,7 +13,18 @@ from softloop.controller import references
 from softloop.controller.config import ControllerConfig
 from softloop.controller.feasibility import check_angle_plan, check_pressure_plan
 from softloop.controller.laws.arc import STEP1
-from softloop.controller.records import CONFIG, CONTROLLER_STATE, CYCLE, GAINS, INPUTS, LAW_PRESSURE, LAWS, MODE_HOLD, MODE_RULES
+from softloop.controller.records import (
+    CONFIG,
+    CONTROLLER_STATE,
+    CYCLE,
+    GAINS,
+    INPUTS,
+    LAW_PRESSURE,
+    LAWS,
+    MODE_HOLD,
+    MODE_RULES,
+    OBSERVED_LAWS,
+)
 from softloop.controller.references import Plan
 from softloop.controller.tick import SCRATCH, controller_tick_of_arrays
 from softloop.dynamics.parameters import B0, Parameters, load_parameters, model_record, shipped
@@ -114,6 +125,7 @@ def config_record(config: ControllerConfig, plan: Plan) -> Any:
     record.inclination_delay_ns = round(config.inclination_delay_ms * MS)
     record.actuation_delay_ns = round(config.actuation_delay_ms * MS)
     record.predict = config.predict
+    record.observe = config.law in OBSERVED_LAWS
     return record
 
 
@@ -130,12 +142,16 @@ def gains_record(config: ControllerConfig, model: Any) -> Any:
     gains.actuation.switch_ticks = actuation.switch_ticks
     gains.actuation.bias_fraction = actuation.bias_fraction
     gains.actuation.current_max_ma = model.current_max_ma
-    for record, table in ((gains.pid, config.pid), (gains.arc, config.arc), (gains.pressure, config.pressure)):
+    for law in ("pid", "smc", "arc", "arc_eso", "pressure", "observer"):
+        record, table = gains[law], getattr(config, law)
         for name in record.dtype.names:
             if name in type(table).model_fields and name not in ("gamma", "rate_limit"):
                 record[name] = getattr(table, name)
+    gains.observer.line_s = 1e-3 * config.observer.line_ms
     width = model.theta_max - model.theta_min
     gains.arc.gamma[:] = config.arc.gamma_valve * width**2
     gains.arc.gamma[: B0 + 1] = config.arc.gamma * width[: B0 + 1] ** 2
     gains.arc.rate_limit[:] = config.arc.rate_limit * width
+    gains.arc_eso.gamma[: B0 + 1] = config.arc_eso.gamma * width[: B0 + 1] ** 2
+    gains.arc_eso.rate_limit[:] = config.arc_eso.rate_limit * width
     return gains

@@ -8,15 +8,21 @@ import numpy as np
 from numba import types
 
 from softloop.controller.actuation import actuate
-from softloop.controller.estimator import measure
+from softloop.controller.estimator import measure, read_samples
 from softloop.controller.laws.arc import STEP1_TYPE, arc_step
+from softloop.controller.laws.arc_eso import arc_eso_step
 from softloop.controller.laws.pid import pid_step
 from softloop.controller.laws.pressure import pressure_step
+from softloop.controller.laws.smc import smc_step
+from softloop.controller.observer import begin_observer, observe
 from softloop.controller.records import (
     CONFIG_TYPE,
     CYCLE_TYPE,
     DEMAND,
     DEMAND_TYPE,
+    EST_FLOWS,
+    EST_INCLINATION_NS,
+    EST_PRESSURE_NS,
     GAINS_TYPE,
     GATE_ARMED,
     IN_APPROACH_START,
@@ -29,11 +35,16 @@ from softloop.controller.records import (
     IN_SUPPLY_KPA,
     INPUTS_TYPE,
     LAW_ARC,
+    LAW_ARC_ESO,
     LAW_PID,
+    LAW_PID_ESO,
     LAW_PRESSURE,
+    LAW_SMC,
     MEASUREMENT,
     MEASUREMENT_TYPE,
     MODE_HOLD,
+    N_FLOWS,
+    OBSERVER_TYPE,
     PHASE_APPROACH,
     PHASE_DONE,
     PHASE_TRACK,
@@ -44,6 +55,7 @@ from softloop.controller.records import (
     STATE_TYPE,
 )
 from softloop.controller.references import polynomial_at, reference_at
+from softloop.controller.valve_drive import drive_valves, note_flow
 from softloop.dynamics.parameters import MODEL_TYPE, THETA_TYPE
 from softloop.wire.kernel import array_of, kernel, record_dtype, record_type
 
@@ -94,6 +106,7 @@ def begin_approach(config: Any, inputs: Any, knots: np.ndarray, table: np.ndarra
     state.pid.integral_kpa = inputs.pressure.chamber_pressure_kpa
     state.mode = MODE_HOLD
     state.mode_ticks = 0
+    begin_observer(inputs, state.observer)
 
 
 @kernel(types.void(CONFIG_TYPE, INPUTS_TYPE, array_of(_F8), array_of(_F8, 2), STATE_TYPE, SCRATCH_TYPE))
@@ -128,10 +141,14 @@ def reference_now(config: Any, knots: np.ndarray, table: np.ndarray, state: Any,
 @kernel(types.void(types.i8, MODEL_TYPE, MEASUREMENT_TYPE, REFERENCE_TYPE, GAINS_TYPE, STATE_TYPE, STEP1_TYPE, DEMAND_TYPE))
 def law_step(law: int, model: Any, measurement: Any, reference: Any, gains: Any, state: Any, first: Any, demand: Any) -> None:
     """The law of this run; a new law is one more line here and one file beside the others."""
-    if law == LAW_PID:
+    if law in (LAW_PID, LAW_PID_ESO):
         pid_step(measurement, reference, gains, state, demand)
     elif law == LAW_ARC:
         arc_step(model, measurement, reference, gains, state, first, demand)
+    elif law == LAW_SMC:
+        smc_step(model, measurement, reference, gains, state, first, demand)
+    elif law == LAW_ARC_ESO:
+        arc_eso_step(model, measurement, reference, gains, state, first, demand)
     elif law == LAW_PRESSURE:
         pressure_step(measurement, reference, gains, state, demand)
 
@@ -163,6 +180,21 @@ def record_inputs(inputs: Any, state: Any, cycle: Any) -> None:
     cycle.gate = inputs.valves.gate
 
 
+@kernel(types.void(OBSERVER_TYPE, CYCLE_TYPE))
+def record_observer(observer: Any, cycle: Any) -> None:
+    """All that the observer knows, into the cycle record; `recall` reads it back."""
+    e = cycle.estimator
+    e[0], e[1], e[2] = observer.angle_deg, observer.rate_deg_s, observer.disturbance_deg_s2
+    e[3], e[4], e[5] = observer.gyro_bias_deg_s, observer.chamber_kpa, observer.charge_offset_ma
+    e[6], e[7], e[8] = observer.exhaust_offset_ma, observer.hold_kpa_s, observer.charge_play_ma
+    e[9], e[10], e[11] = observer.exhaust_play_ma, observer.innovation_deg_s, observer.innovation_power
+    e[12] = observer.innovation_pair
+    e[EST_INCLINATION_NS] = cycle.stamp_ns - observer.inclination_ns
+    e[EST_PRESSURE_NS] = cycle.stamp_ns - observer.pressure_ns
+    for j in range(N_FLOWS):
+        e[EST_FLOWS + j] = observer.flow_kpa_s[j]
+
+
 @kernel(types.void(CONFIG_TYPE, MEASUREMENT_TYPE, REFERENCE_TYPE, DEMAND_TYPE, STATE_TYPE, types.b1, CYCLE_TYPE))
 def record_thoughts(config: Any, measurement: Any, reference: Any, demand: Any, state: Any, valid: bool, cycle: Any) -> None:
     """What this tick made of it, into the cycle record."""
@@ -175,7 +207,7 @@ def record_thoughts(config: Any, measurement: Any, reference: Any, demand: Any, 
         cycle.reference_deg, cycle.reference_rate_deg_s = np.nan, np.nan
         cycle.reference_acceleration_deg_s2, cycle.reference_jerk_deg_s3 = np.nan, np.nan
     cycle.angle_estimate_deg, cycle.rate_estimate_deg_s = measurement.angle_deg, measurement.rate_deg_s
-    cycle.disturbance_deg_s2 = 0.0
+    cycle.disturbance_deg_s2 = measurement.disturbance_deg_s2
     cycle.error_deg, cycle.s1_deg_s, cycle.s2_kpa = demand.error, demand.s1, demand.s2
     cycle.desired_pressure_kpa, cycle.demanded_flow_kpa_s = demand.desired_pressure_kpa, demand.flow_kpa_s
     cycle.charge_current_ma, cycle.exhaust_current_ma = state.charge_ma, state.exhaust_ma
@@ -186,6 +218,8 @@ def record_thoughts(config: Any, measurement: Any, reference: Any, demand: Any, 
     cycle.internal[IN_INTEGRAL_KPA], cycle.internal[IN_MODE_TICKS] = state.pid.integral_kpa, state.mode_ticks
     cycle.internal[IN_APPROACH_START] = state.approach[0]
     cycle.internal[IN_CHARGE_BEFORE_MA], cycle.internal[IN_EXHAUST_BEFORE_MA] = state.charge_before_ma, state.exhaust_before_ma
+    record_observer(state.observer, cycle)
+    cycle.observing, cycle.trusted = config.observe, measurement.trust >= 1.0
     cycle.phase, cycle.mode = state.phase, state.mode
     cycle.inputs_valid, cycle.saturated, cycle.adapting = valid, state.saturated, measurement.adapt
 
@@ -215,12 +249,21 @@ def controller_tick(
     measurement, reference, demand = scratch.measurement, scratch.reference, scratch.demand
     valid = inputs_valid(config, inputs)
     follow_phase(config, inputs, knots, table, state, scratch)
-    measure(config, model, inputs, state, measurement)
+    active = state.phase == PHASE_APPROACH or state.phase == PHASE_TRACK
+    if config.observe and active:
+        read_samples(config, inputs, state, measurement)
+        observe(config, model, gains, inputs, state, measurement)
+    else:
+        measure(config, model, inputs, state, measurement)
     measurement.adapt = valid and state.saturated == 0 and state.phase != PHASE_WAIT
     acts_ns = inputs.now_ns + (config.actuation_delay_ns if config.predict else 0)
     reference_now(config, knots, table, state, acts_ns, reference)
-    if state.phase == PHASE_APPROACH or state.phase == PHASE_TRACK:
+    if active:
         law_step(config.law, model, measurement, reference, gains, state, first, demand)
+    if active and config.observe:
+        drive_valves(gains, model, measurement, demand, state)
+        note_flow(gains, model, measurement, demand, state, inputs.skipped + 1)
+    elif active:
         actuate(gains.actuation, model, measurement, demand, state)
     else:
         stand_still(state, demand)

@@ -153,6 +153,37 @@ def same(
 
 
 @app.command()
+def tune(
+    law: Annotated[str, typer.Argument(metavar="LAW", help="pid, pid_eso, smc, arc or arc_eso.")],
+    seeds: Annotated[str, typer.Option(metavar="A:B", help="Tuning rigs; judge on others.")] = "1000:1002",
+    added_ms: Annotated[float, typer.Option(metavar="MS", min=0.0, max=150.0, help="Latency added to the rig's own.")] = 0.0,
+    evaluations: Annotated[int, typer.Option(metavar="N", min=1, help="At least so many.")] = 500,
+    search_seed: Annotated[int, typer.Option(metavar="N", min=1, help="Of the optimiser.")] = 1,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the [controller] table here.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The outcome as JSON.")] = False,
+) -> int:
+    """Search a law's gains with CMA-ES in simulated runs; the same cost and budget for every law."""
+    from softloop.deploy.tune import run_tune
+
+    return run_tune(law, seeds, added_ms, evaluations, search_seed, out, as_json=as_json)
+
+
+@app.command()
+def evaluate(
+    seeds: Annotated[str, typer.Option(metavar="A:B", help="The rigs to judge on; not those of tuning.")] = "0:20",
+    laws: Annotated[str, typer.Option(metavar="LAW,LAW", help="Default: all.")] = "",
+    only: Annotated[str, typer.Option(metavar="CONDITION", help='One condition, such as "own latency"; default: all.')] = "",
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw Figs. 6 and 7 of all laws there.")] = None,
+    confirm: Annotated[int, typer.Option(metavar="N", min=0, help="Run the first N rigs at wall pace too, all processes.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Everything as JSON, every rig.")] = False,
+) -> int:
+    """Judge every law with its tuned gains on many simulated rigs; exit code 1 where arc_eso misses a bar of its own."""
+    from softloop.deploy.evaluate import run_evaluate
+
+    return run_evaluate(seeds, laws, only, figures, confirm, as_json=as_json)
+
+
+@app.command()
 def warm(quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False) -> int:
     """Compile every kernel once; later starts load them from the cache."""
     from softloop.deploy.prepare import warm as warm_all

@@ -86,6 +86,7 @@ class PlantConfig(Table):
 
     supply_sensor: SensorConfig = SensorConfig()
     chamber_sensor: SensorConfig = SensorConfig()
+    ambient_c: float | None = Field(None, ge=-20, le=60, description="of room, air and silicone; default: drawn by seed")
     pressure_noise_kpa: float = Field(0.1, ge=0, description="standard deviation of a pressure reading's noise")
     pressure_rise_ms: float = Field(3.0, ge=0, description="10 to 90 % of the sensors; none in the ideal layer")
     angle_noise_deg: float = Field(0.05, ge=0, description="likewise of the inclinometer's angle")

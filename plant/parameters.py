@@ -9,6 +9,7 @@ data sheets of such parts show, and stand here once. What differs from rig to ri
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import sqrt
 from typing import Any, Literal
 
@@ -57,15 +58,18 @@ CONTACT_S_DEG = 0.02
 ZERO_C_K = 273.15
 
 
-def draw_rig(layer: Layer, seed: int, parameters: Parameters) -> Any:
+def draw_rig(layer: Layer, seed: int, parameters: Parameters, ambient_c: float | None = None) -> Any:
     """A `PLANT` record of `layer` with its physics filled in; sensors and wires are `plant.setup`'s.
 
     Args:
         layer: "ideal" takes nothing from the seed but the phases of its clocks.
         seed: which rig, 0 or more.
         parameters: the parameter file about which the rig is drawn.
+        ambient_c: temperature in place of the drawn one; the ideal layer stays at the model's.
     """
     drawn = draw(seed)
+    if ambient_c is not None:
+        drawn = replace(drawn, ambient_c=ambient_c)
     plant = new_record(PLANT)
     plant.seed, plant.rig = seed, layer == "rig"
     plant.n_states = N_STATES if plant.rig else N_IDEAL

@@ -55,7 +55,7 @@ def plant_parameters(config: PlantConfig) -> Parameters:
 def plant_record(config: PlantConfig, wires: WireTimes | None = None) -> Any:
     """The `PLANT` record of a `[plant]` table. Raises BadFile or BadConfig when its parameter file is not usable."""
     parameters, wires = plant_parameters(config), wires or WireTimes()
-    plant = draw_rig(config.layer, config.seed, parameters)
+    plant = draw_rig(config.layer, config.seed, parameters, config.ambient_c)
     drawn = draw(config.seed) if config.layer == "rig" else Draws(phases=draw(config.seed).phases)
     plant.step_ns = config.step_us * 1000
     electrical = plant.electrical

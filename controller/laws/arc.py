@@ -15,6 +15,7 @@ from numba import types
 
 from softloop.controller.actuation import choose_mode, current_for_flow
 from softloop.controller.records import (
+    ACTUATION_TYPE,
     ARC_GAINS_TYPE,
     DEMAND_TYPE,
     GAINS_TYPE,
@@ -128,10 +129,14 @@ def second_step(model: Any, gains: Any, state: Any, measurement: Any, first: Any
     return nominal + theta[k_v1] / model.theta_min[k_v1] * feedback
 
 
-@kernel(types.void(MODEL_TYPE, MEASUREMENT_TYPE, REFERENCE_TYPE, GAINS_TYPE, STATE_TYPE, STEP1_TYPE, DEMAND_TYPE))
-def arc_step(model: Any, measurement: Any, reference: Any, gains: Any, state: Any, first: Any, demand: Any) -> None:
-    """One step of C3; fills `demand` and moves the estimates in `state.theta`. `first` is scratch."""
-    g, theta = gains.arc, state.theta
+@kernel(
+    types.void(
+        MODEL_TYPE, MEASUREMENT_TYPE, REFERENCE_TYPE, ACTUATION_TYPE, ARC_GAINS_TYPE, STATE_TYPE, STEP1_TYPE, DEMAND_TYPE
+    )
+)  # fmt: skip
+def backstep(model: Any, measurement: Any, reference: Any, actuation: Any, g: Any, state: Any, first: Any, demand: Any) -> None:
+    """Both steps with the gains `g`; moves the estimates where `measurement.adapt` is set. `first` is scratch."""
+    theta = state.theta
     first_step(model, g, theta, state.arc.phi, measurement, reference, first)
     s2 = measurement.chamber_kpa - first.desired
     estimated = bending_drift(theta, measurement.angle_deg, measurement.rate_deg_s) + theta[B0] * measurement.chamber_kpa
@@ -140,7 +145,7 @@ def arc_step(model: Any, measurement: Any, reference: Any, gains: Any, state: An
     nominal = moving - theta[B0] * first.s1 / g.rho  # the flow of I_ia, Eq. 45
     demand.flow_kpa_s = nominal - g.k2 * s2
     demand.desired_pressure_kpa, demand.error, demand.s1, demand.s2 = first.desired, first.error, first.s1, s2
-    demand.mode = choose_mode(gains.actuation, reference, first.error, demand.flow_kpa_s, state)
+    demand.mode = choose_mode(actuation, reference, first.error, demand.flow_kpa_s, state)
     for i in range(KV1_CHARGE, KV6_EXHAUST + 1):
         state.arc.tau[i] = 0.0  # a closed valve teaches nothing (Mode 3, or the other one)
     if demand.mode != MODE_HOLD:
@@ -149,3 +154,9 @@ def arc_step(model: Any, measurement: Any, reference: Any, gains: Any, state: An
         for i in range(theta.size):
             rate = g.gamma[i] * state.arc.tau[i]
             theta[i] = adapted(theta[i], rate, g.rate_limit[i], model.theta_min[i], model.theta_max[i], measurement.period_s)
+
+
+@kernel(types.void(MODEL_TYPE, MEASUREMENT_TYPE, REFERENCE_TYPE, GAINS_TYPE, STATE_TYPE, STEP1_TYPE, DEMAND_TYPE))
+def arc_step(model: Any, measurement: Any, reference: Any, gains: Any, state: Any, first: Any, demand: Any) -> None:
+    """One step of C3; fills `demand` and moves the estimates in `state.theta`. `first` is scratch."""
+    backstep(model, measurement, reference, gains.actuation, gains.arc, state, first, demand)

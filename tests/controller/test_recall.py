@@ -12,7 +12,7 @@ from softloop.controller.setup import PERIOD_NS, build
 NOT_STATE = {"arc", "started", "approach_ns"}
 
 
-@pytest.fixture(params=["pid", "arc", "pressure"])
+@pytest.fixture(params=["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure"])
 def controller(request):
     trajectory = "excitation_1hz" if request.param == "pressure" else "t1"
     return build(ControllerConfig(law=request.param, trajectory=trajectory, approach_s=0.1))

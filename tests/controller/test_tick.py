@@ -26,7 +26,7 @@ def fed(controller, tick, armed=True, angle=26.75, pressure=0.5, age_ns=3 * MS, 
     return controller.tick()
 
 
-@pytest.fixture(params=["pid", "arc", "pressure"])
+@pytest.fixture(params=["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure"])
 def controller(request):
     trajectory = "excitation_1hz" if request.param == "pressure" else "t1"
     return build(ControllerConfig(law=request.param, trajectory=trajectory, approach_s=0.05))

@@ -1,0 +1,165 @@
+"""`softloop evaluate`: the comparison of laws with its progress, its tables, its pictures, and its runs at wall pace."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from softloop.deploy.bench import find_bench
+from softloop.deploy.tune import seeds_of
+from softloop.offline.closed_loop import simulate_run
+from softloop.offline.comparison_figures import save, side_by_side
+from softloop.offline.evaluation import (
+    CONDITIONS,
+    LAWS,
+    OWN,
+    PAPER_DEG,
+    RECOVERY_S,
+    Verdict,
+    evaluate,
+    figures,
+    tuned,
+    tuned_file,
+)
+from softloop.offline.tuning import BARS_DEG, SWITCHES_PER_S
+from softloop.plant.config import PlantConfig
+from softloop.wire.benchfile import read_toml
+from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
+
+_COLUMNS = {
+    "T1": "t1_max_deg",
+    "steady": "t1_steady_deg",
+    "T2": "t2_max_deg",
+    "payload": "payload_peak_deg",
+    "back, s": "payload_recovery_s",
+    "leaves": "left_peak_deg",
+    "sw/s dwell": "dwell_switches_per_s",
+    "sw/s T2": "t2_switches_per_s",
+    "effort T2": "t2_effort_ma_s",
+}
+_SHARE_OF_RIGS = 0.9  # of the rigs on which the bars must hold: 18 of 20
+
+
+def run_evaluate(seeds: str, laws: str, only: str, figures_dir: Path | None, confirm: int, *, as_json: bool) -> int:
+    """Evaluate, show; exit code 1 where `arc_eso` at the rig's own latency misses a bar. Raises BadFile or BadConfig."""
+    rigs, chosen = seeds_of(seeds), _laws(laws)
+    conditions = [c for c in CONDITIONS if only in ("", c.name)]
+    if not conditions:
+        raise BadConfig(f"condition '{only}': there is none of that name; there are: {', '.join(c.name for c in CONDITIONS)}")
+    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("evaluating", total=None)
+        verdicts = evaluate(chosen, conditions, rigs, lambda done, total: bar.update(task, completed=done, total=total))
+    confirmed = confirm_runs(chosen, rigs[:confirm]) if confirm else []
+    if figures_dir is not None:
+        draw(chosen, rigs[0], figures_dir)
+    latency = latency_budget(chosen[-1], rigs[0])
+    if as_json:
+        content = [v.content() for v in verdicts]
+        print(json.dumps({"seeds": seeds, "latency_ms": latency, "verdicts": content, "wall_pace": confirmed}))
+    else:
+        show(verdicts, latency, confirmed)
+    return EXIT_OK if _kept(verdicts) else EXIT_NEGATIVE
+
+
+def _laws(text: str) -> tuple[str, ...]:
+    chosen = tuple(name.strip() for name in text.split(",")) if text else LAWS
+    for name in chosen:
+        if name not in LAWS:
+            raise BadConfig(f"law '{name}' is not evaluated; these are: {', '.join(LAWS)}")
+    return chosen
+
+
+def _kept(verdicts: Sequence[Verdict]) -> bool:
+    for verdict in verdicts:
+        if verdict.law == "arc_eso" and verdict.condition == OWN.name:
+            found = figures(verdict.judged)
+            return all(found[n] >= _SHARE_OF_RIGS * found["rigs"] for n in ("bars_kept", "payload_kept", "quiet"))
+    return True
+
+
+def latency_budget(law: str, seed: int) -> dict[str, float]:
+    """Median ages at the tick, and from the tick to the driver, in ms, in one T1 run at the rig's own latency."""
+    controller, _ = tuned(law)
+    run = simulate_run(controller, PlantConfig(seed=seed))
+    cycles, truths = run.cycles[200:], run.truths[200:]
+    answered = truths["command_applied_ns"] - np.roll(cycles["stamp_ns"], 1)
+    return {
+        "pressure_age_ms": 1e-6 * float(np.median(cycles["pressure_age_ns"])),
+        "inclination_age_ms": 1e-6 * float(np.median(cycles["inclination_age_ns"])),
+        "tick_to_driver_ms": 1e-6 * float(np.median(answered[1:])),
+        "declared_tick_to_opening_ms": controller.actuation_delay_ms,
+    }
+
+
+def show(verdicts: Sequence[Verdict], latency: dict[str, float], confirmed: list[dict[str, Any]]) -> None:
+    """One table per condition: the worst rig's figure, and the median's."""
+    console = Console(width=190)
+    hops = ", ".join(f"{name.removesuffix('_ms').replace('_', ' ')} {value:.2f} ms" for name, value in latency.items())
+    console.print(f"latency budget: {hops}")
+    for condition in dict.fromkeys(v.condition for v in verdicts):
+        title = f"{condition}: worst (median) of the rigs; deg, deg, deg, deg, s, deg, 1/s, 1/s, mA/s"
+        table = Table(title=title, title_justify="left")
+        table.add_column("law")
+        for head in (*_COLUMNS, "bars", "payload", "paper"):
+            table.add_column(head, justify="right")
+        for verdict in (v for v in verdicts if v.condition == condition):
+            table.add_row(f"{verdict.law}, tuned at +{verdict.tuned_at_ms:g} ms", *_row(verdict))
+        console.print(table)
+    paper = ", ".join(f"{name} {bound:g}" for name, bound in PAPER_DEG.items())
+    bars = ", ".join(f"{name} {bar:g}" for name, bar in BARS_DEG.items())
+    console.print(f"bars, deg: {bars}; back under 0.5 deg in {RECOVERY_S:g} s; {SWITCHES_PER_S:g} switches per second on dwells")
+    console.print(f"the paper's ARC, deg: {paper}")
+    for run in confirmed:
+        console.print(f"wall pace: {run}")
+
+
+def _row(verdict: Verdict) -> list[str]:
+    found = figures(verdict.judged)
+    cells = [f"{found[name]['worst']:.2f} ({found[name]['median']:.2f})" for name in _COLUMNS.values()]
+    return cells + [f"{found[name]}/{found['rigs']}" for name in ("bars_kept", "payload_kept", "paper_kept")]
+
+
+def draw(laws: Sequence[str], seed: int, folder: Path) -> None:
+    """Figs. 6 and 7 of every law side by side, on one rig."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for trajectory, name in (("t1", "fig6_all_laws.png"), ("t2", "fig7_all_laws.png")):
+        runs = {
+            law: simulate_run(tuned(law)[0].model_copy(update={"trajectory": trajectory}), PlantConfig(seed=seed)) for law in laws
+        }
+        save(side_by_side(runs, f"{trajectory.upper()} on rig {seed}, every law with its tuned gains"), folder / name)
+
+
+def confirm_runs(laws: Sequence[str], seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """T1 and T2 of every law over the whole stack at wall pace: one `softloop run` each. Raises BadFile or BadConfig."""
+    jobs = [(law, seed, trajectory) for law in laws for seed in seeds for trajectory in ("t1", "t2")]
+    found = []
+    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
+        for law, seed, trajectory in bar.track(jobs, description="running at wall pace"):
+            found.append({"law": law, "seed": seed, "trajectory": trajectory, **_run_at_wall_pace(law, seed, trajectory)})
+    return found
+
+
+def _run_at_wall_pace(law: str, seed: int, trajectory: str) -> dict[str, Any]:
+    content = tomlkit.parse(find_bench(Path("sim")).read_text())
+    content["plant"]["seed"] = seed
+    content["controller"] = {**read_toml(tuned_file(law))["controller"], "trajectory": trajectory}
+    with tempfile.TemporaryDirectory(prefix="softloop-") as folder:
+        bench, run_dir = Path(folder) / "bench.toml", Path(folder) / "run"
+        bench.write_text(tomlkit.dumps(content))
+        command = [sys.executable, "-m", "softloop.deploy.cli", "run", str(bench), "--run-dir", str(run_dir), "--no-report", "-q"]
+        code = subprocess.run(command, check=False).returncode
+        path = run_dir / "summary.json"
+        summary = json.loads(path.read_text()) if path.is_file() else {}
+    names = ("truth_error_max_deg", "truth_error_steady_deg", "evidence_valid")
+    return {"exit_code": code, **{name: summary.get(name) for name in names}}
