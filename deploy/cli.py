@@ -152,6 +152,26 @@ def same(
     return same_runs(first, second, as_json=as_json)
 
 
+@app.command(epilog=EXIT_CODES)
+def batch(
+    bench: BenchArgument,
+    seeds: Annotated[str, typer.Option(metavar="A:B", help="Rigs to draw: 0:1000 is a thousand of them, 7 is one.")],
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that share the work.")] = 1,
+    law: Annotated[list[str] | None, typer.Option(help="Instead of the bench's; several with commas, or again.")] = None,
+    trajectory: Annotated[list[str] | None, typer.Option(help="Likewise: t1, t2, or the path of a CSV file.")] = None,
+    payload: Annotated[bool, typer.Option("--payload", help="Each run once more, with a payload that comes and leaves.")] = False,
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Work on the Dask cluster of this scheduler.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/<bench>-batch-<UTC time>.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
+) -> int:
+    """Run a bench on many simulated rigs, without its processes: every law and trajectory, as a table and a picture."""
+    from softloop.deploy.batch import Wanted
+    from softloop.deploy.batch import batch as run_batch
+
+    laws, trajectories = (tuple(name for text in given or () for name in text.split(",")) for given in (law, trajectory))
+    return run_batch(bench, Wanted(seeds, laws, trajectories, jobs, payload, scheduler, out, as_json))
+
+
 @app.command()
 def tune(
     law: Annotated[str, typer.Argument(metavar="LAW", help="pid, pid_eso, smc, arc or arc_eso.")],

@@ -113,7 +113,8 @@ def _within(stamps_ns: Ints, spans: list[tuple[int, int]]) -> NDArray[np.bool_]:
     return inside
 
 
-def _errors(stamps_ns: Ints, error_deg: Floats, cycles: Records) -> Errors:
+def errors_at(stamps_ns: Ints, error_deg: Floats, cycles: Records) -> Errors:
+    """Errors with their times and what is steady, from the cycle records of PHASE_TRACK."""
     start = cycles["stamp_ns"][0] if len(cycles) else 0
     return Errors((stamps_ns - start) * 1e-9, error_deg, _within(stamps_ns, steady_spans_ns(cycles)))
 
@@ -124,7 +125,7 @@ def truth_errors(log: Log) -> Errors:
     if not len(truth):
         cycles = cycles[:0]
     angle = interpolate(cycles["stamp_ns"], truth["stamp_ns"], truth["angle_deg"])
-    return _errors(cycles["stamp_ns"], angle - cycles["reference_deg"], cycles)
+    return errors_at(cycles["stamp_ns"], angle - cycles["reference_deg"], cycles)
 
 
 def sensor_errors(log: Log) -> Errors:
@@ -136,7 +137,7 @@ def sensor_errors(log: Log) -> Errors:
         first, last = cycles["stamp_ns"][0], cycles["stamp_ns"][-1]
         samples = samples[(samples["stamp_ns"] >= first) & (samples["stamp_ns"] <= last)]
     reference = interpolate(samples["stamp_ns"], cycles["stamp_ns"], cycles["reference_deg"])
-    return _errors(samples["stamp_ns"], samples["angle_deg"] - reference, cycles)
+    return errors_at(samples["stamp_ns"], samples["angle_deg"] - reference, cycles)
 
 
 def pressure_errors_kpa(log: Log) -> Floats:
