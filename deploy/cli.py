@@ -133,12 +133,18 @@ def identify(
         Literal["coloured", "bootstrap", "white"], typer.Option(help="What the residuals are taken for.")
     ] = "coloured",
     select: Annotated[bool, typer.Option("--select", help="Compare orders instead.")] = False,
+    venting: Annotated[
+        bool, typer.Option("--venting", help="Fit the flow law of an emptying volume; map time, pressure and maybe input.")
+    ] = False,
+    train: Annotated[int, typer.Option(metavar="N", help="With --venting: the first N files train.")] = 1,
     figure: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw measured and simulated angle.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
 ) -> int:
     """Identify the bending model from logs or CSV files, with intervals, and score it by free simulation."""
     from softloop.deploy import identify as identification
 
+    if venting:
+        return identification.identify_vent(tuple(csv or ()), tuple(columns or ()), train, as_json=as_json)
     asked = identification.Asked(
         tuple(runs or ()), tuple(csv or ()), tuple(columns or ()), orders, hysteresis, creep, delay, lag, at_rest, method,
         interval, select, figure, as_json,

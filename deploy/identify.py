@@ -12,7 +12,7 @@ from rich.table import Table
 
 from softloop.deploy.progress import counted_progress
 from softloop.dynamics.parameters import load_parameters, shipped
-from softloop.offline.identification.csv_map import parse_map, read_csv
+from softloop.offline.identification.csv_map import parse_map, read_csv, read_vent
 from softloop.offline.identification.experiments import halves
 from softloop.offline.identification.fitting import bare_of, fit_output_error
 from softloop.offline.identification.intervals import Uncertainty, of_fit, of_regression
@@ -21,6 +21,7 @@ from softloop.offline.identification.output_error import Fit, score
 from softloop.offline.identification.regression import as_fit, instrumental_variables, least_squares
 from softloop.offline.identification.series import Series, from_log
 from softloop.offline.identification.structure import PAPER, Structure
+from softloop.offline.identification.venting import fit_vent, score_vent
 from softloop.offline.log import find_log, open_log
 from softloop.wire.errors import EXIT_OK, BadConfig
 
@@ -71,6 +72,30 @@ def identify(asked: Asked) -> int:
         print(json.dumps(as_dict(answer), indent=2))
     else:
         _show(answer)
+    return EXIT_OK
+
+
+def identify_vent(files: tuple[Path, ...], columns: tuple[str, ...], trained: int, *, as_json: bool) -> int:
+    """Fit the flow law to the ventings of the first `trained` files, score it on the others, and say it."""
+    if not 1 <= trained <= len(files):
+        raise BadConfig(f"--train {trained}: must be 1 to {len(files)}, the number of files")
+    mapped = parse_map(columns, ("time", "pressure"), ("input",))
+    runs = [read_vent(path, mapped) for path in files]
+    found = fit_vent(runs[:trained])
+    sure, (low, high) = found.uncertainty, found.uncertainty.interval()
+    own = dict(zip((r.name for r in runs), found.fits, strict=False))
+    scores = {r.name: score_vent(sure.values, r) for r in runs[trained:]}
+    if as_json:
+        rows = {n: {"value": v, "low": a, "high": b} for n, v, a, b in zip(sure.names, sure.values, low, high, strict=True)}
+        print(json.dumps({"parameters": rows, "train": own, "validate": scores, "rank": found.rank}, indent=2))
+        return EXIT_OK
+    for name, value, a, b in zip(sure.names, sure.values, low, high, strict=True):
+        print(f"{name} {value:.4g} (95 %: {a:.4g} to {b:.4g})")
+    print(f"area, laminar conductance, wall and volume: rank {found.rank} of 4; only ratios to the volume are identifiable")
+    for name, fit in own.items():
+        print(f"  {name} (trained) {fit:.2f} %")
+    for name, fit in scores.items():
+        print(f"  {name} (unseen) {fit:.2f} %")
     return EXIT_OK
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softloop.offline.identification.series import LEAST_SAMPLES, Series
+from softloop.offline.identification.venting import Vent, vent_of
 from softloop.wire.errors import BadConfig, BadFile
 
 Floats = NDArray[np.float64]
@@ -32,13 +33,13 @@ class Column:
 Map = dict[str, tuple[Column, ...]]
 
 
-def parse_map(entries: Sequence[str], needed: Sequence[str] = NEEDED) -> Map:
+def parse_map(entries: Sequence[str], needed: Sequence[str] = NEEDED, optional: Sequence[str] = ()) -> Map:
     """`["time=t_s", "pressure=P1_kPa,P2_kPa", ...]` as a map. Raises BadConfig with one line."""
     found: Map = {}
     for entry in entries:
         key, equals, columns = entry.partition("=")
-        if not equals or key not in needed or not columns:
-            raise BadConfig(f"--map {entry}: must be KEY=COLUMN with KEY one of {', '.join(needed)}")
+        if not equals or key not in (*needed, *optional) or not columns:
+            raise BadConfig(f"--map {entry}: must be KEY=COLUMN with KEY one of {', '.join((*needed, *optional))}")
         found[key] = tuple(_column(text, entry) for text in columns.split(","))
         if key != "pressure" and len(found[key]) != 1:
             raise BadConfig(f"--map {entry}: only 'pressure' may have several columns")
@@ -71,6 +72,22 @@ def read_csv(path: Path, columns: Map) -> Series:
     series = Series(path.stem, time_s, np.stack(taken("pressure"), axis=1), taken("angle")[0])
     _check(path, series)
     return series
+
+
+def read_vent(path: Path, columns: Map) -> Vent:
+    """One file as a venting. Raises BadFile as `read_csv` does."""
+    table = _table(path)
+    missing = sorted({c.name for group in columns.values() for c in group} - set(table))
+    if missing:
+        raise BadFile(f"{path}: there is no column {', '.join(missing)}; there are: {', '.join(table)}")
+    taken = {key: table[group[0].name] * group[0].factor for key, group in columns.items()}
+    bad = np.flatnonzero(~np.isfinite(np.column_stack(list(taken.values()))).all(axis=1))
+    if len(bad):
+        raise BadFile(f"{path}: row {bad[0] + 2} holds no number where one is needed")
+    back = np.flatnonzero(np.diff(taken["time"]) <= 0)
+    if len(back):
+        raise BadFile(f"{path}: row {back[0] + 3}: time must rise from row to row")
+    return vent_of(path.stem, taken["time"], taken["pressure"], taken.get("input"))
 
 
 def _check(path: Path, series: Series) -> None:

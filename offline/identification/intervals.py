@@ -107,6 +107,12 @@ def _meat(error: Floats, columns: Floats, method: str) -> Floats:
     return shaped.T @ shaped * variance
 
 
+def autoregressive_covariance(error: Floats, jacobian: Floats) -> Floats:
+    """Covariance of least squares unknowns (q, q) from residuals (n,) that are autoregressive and derivatives (n, q)."""
+    gain = _damped_inverse(jacobian.T @ jacobian)
+    return gain @ _meat(error, jacobian, "coloured") @ gain
+
+
 def autoregressive(error: Floats, most: int = ORDER_MOST) -> tuple[Floats, float]:
     """A(q) = 1 + a1 q^-1 + ... and the variance of its white input, by Yule and Walker, the order by Schwarz's criterion."""
     n = len(error)

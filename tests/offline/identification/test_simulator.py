@@ -18,9 +18,7 @@ def test_eq_2_as_an_adaptive_solver_has_it():
         pressure = np.interp(t, series.time_s, series.pressure_kpa[:, 0])
         return [x[1], -poly(x[0], a) * x[0] - poly(x[0], c) * x[1] + b * pressure + d]
 
-    oracle = solve_ivp(
-        rates, (0.0, series.time_s[-1]), begin, "DOP853", series.time_s, rtol=1e-9, atol=1e-9, max_step=0.005
-    )
+    oracle = solve_ivp(rates, (0.0, series.time_s[-1]), begin, "DOP853", series.time_s, rtol=1e-9, atol=1e-9, max_step=0.005)
     assert np.abs(oracle.y[0] - series.angle_deg).max() < 3e-4  # the oracle's steps do not know the pressure's kinks
 
 
