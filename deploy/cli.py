@@ -204,6 +204,61 @@ def evaluate(
 
 
 @app.command()
+def identify(
+    runs: Annotated[list[Path] | None, typer.Argument(metavar="RUN...", help="Logs of excitation; the first one trains.")] = None,
+    csv: Annotated[
+        list[Path] | None, typer.Option(metavar="FILE", help="A CSV file; the first one trains, more validate.")
+    ] = None,
+    columns: Annotated[list[str] | None, typer.Option("--map", metavar="KEY=COLUMN", help="time, pressure and angle.")] = None,
+    orders: Annotated[str, typer.Option(metavar="m,n,r", help="Orders of a(y), b(y) and c(y).")] = "2,0,3",
+    hysteresis: Annotated[int, typer.Option(min=0, max=4, help="How many Bouc-Wen elements.")] = 0,
+    creep: Annotated[int, typer.Option(min=0, max=4, help="How many Prony terms.")] = 0,
+    delay: Annotated[bool, typer.Option("--delay", help="Estimate the angle's delay behind the pressure.")] = False,
+    lag: Annotated[bool, typer.Option("--lag", help="Estimate a first-order lag of the angle's sensor.")] = False,
+    at_rest: Annotated[
+        bool, typer.Option("--at-rest", help="Every file begins at rest; the zero of its angle is its own.")
+    ] = False,
+    method: Annotated[
+        Literal["oe", "iv", "ls"], typer.Option(help="Output error, instrumental variables, least squares.")
+    ] = "oe",
+    interval: Annotated[
+        Literal["coloured", "bootstrap", "white"], typer.Option(help="What the residuals are taken for.")
+    ] = "coloured",
+    select: Annotated[bool, typer.Option("--select", help="Compare orders instead.")] = False,
+    venting: Annotated[
+        bool, typer.Option("--venting", help="Fit the flow law of an emptying volume; map time, pressure and maybe input.")
+    ] = False,
+    train: Annotated[int, typer.Option(metavar="N", help="With --venting: the first N files train.")] = 1,
+    figure: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw measured and simulated angle.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
+) -> int:
+    """Identify the bending model from logs or CSV files, with intervals, and score it by free simulation."""
+    from softloop.deploy import identify as identification
+
+    if venting:
+        return identification.identify_vent(tuple(csv or ()), tuple(columns or ()), train, as_json=as_json)
+    asked = identification.Asked(
+        tuple(runs or ()), tuple(csv or ()), tuple(columns or ()), orders, hysteresis, creep, delay, lag, at_rest, method,
+        interval, select, figure, as_json,
+    )  # fmt: skip
+    return identification.identify(asked)
+
+
+@app.command()
+def coverage(
+    rigs: Annotated[int, typer.Option(min=1, help="How many rigs; on the rig layer each is excited 40 times.")] = 1000,
+    layer: Annotated[Literal["ideal", "rig"], typer.Option(help="Rigs that are the model, or that have more than it.")] = "ideal",
+    first_seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seeds are N, N+1, ...")] = 1,
+    output: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Write what was counted.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
+) -> int:
+    """Count over simulated rigs whether the intervals of each method hold what they say."""
+    from softloop.deploy.coverage import coverage as count
+
+    return count(layer, rigs, first_seed, output, as_json=as_json)
+
+
+@app.command()
 def warm(quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False) -> int:
     """Compile every kernel once; later starts load them from the cache."""
     from softloop.deploy.prepare import warm as warm_all

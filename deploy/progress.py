@@ -1,4 +1,4 @@
-"""Progress of compiling kernels and of reading a long log, on a terminal only, and only when there is something to wait for."""
+"""Progress of compiling kernels and of long work, on a terminal only, and only when there is something to wait for."""
 
 from __future__ import annotations
 
@@ -29,10 +29,17 @@ def compile_progress(*, quiet: bool) -> Iterator[Callable[[str, int, int], None]
 @contextmanager
 def tick_progress(*, quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """A function `progress(done, total)` that shows how many ticks are done."""
+    with counted_progress("replaying ticks", quiet=quiet) as progress:
+        yield progress
+
+
+@contextmanager
+def counted_progress(what: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """A function `progress(done, total)` that shows how much of `what` is done."""
     if quiet or not sys.stderr.isatty():
         yield lambda done, total: None
         return
 
     with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("replaying ticks", total=None)
+        task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -1,0 +1,189 @@
+"""`softloop identify`: parameters from logs or CSV files, with intervals, and how well they simulate what they have not seen."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from softloop.deploy.progress import counted_progress
+from softloop.dynamics.parameters import load_parameters, shipped
+from softloop.offline.identification.csv_map import parse_map, read_csv, read_vent
+from softloop.offline.identification.experiments import halves
+from softloop.offline.identification.fitting import bare_of, fit_output_error
+from softloop.offline.identification.intervals import Uncertainty, of_fit, of_regression
+from softloop.offline.identification.orders import compare
+from softloop.offline.identification.output_error import Fit, score
+from softloop.offline.identification.regression import as_fit, instrumental_variables, least_squares
+from softloop.offline.identification.series import Series, from_log
+from softloop.offline.identification.structure import PAPER, Structure
+from softloop.offline.identification.venting import fit_vent, score_vent
+from softloop.offline.log import find_log, open_log
+from softloop.wire.errors import EXIT_OK, BadConfig
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the command line asks for."""
+
+    runs: tuple[Path, ...]
+    csv: tuple[Path, ...]
+    columns: tuple[str, ...]
+    orders: str
+    hysteresis: int
+    creep: int
+    delay: bool
+    lag: bool
+    at_rest: bool
+    method: str
+    interval: str
+    select: bool
+    figure: Path | None
+    as_json: bool
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A model, how sure it is, and how it does on other data."""
+
+    fit: Fit
+    uncertainty: Uncertainty
+    train: Series
+    scores: dict[str, float]
+
+
+def identify(asked: Asked) -> int:
+    """Do what was asked and say it. Raises BadFile or BadConfig."""
+    train, validate = _data(asked)
+    structure = _structure(asked, train.pressure_kpa.shape[1])
+    if asked.select:
+        return _select(structure, train, validate, as_json=asked.as_json)
+    fit, uncertainty = fitted(structure, train, asked.method, asked.interval)
+    answer = Answer(fit, uncertainty, train, {v.name: score(fit, v) for v in validate})
+    if asked.figure:
+        from softloop.offline.identification.figures import validation  # noqa: PLC0415 - matplotlib only where it draws
+
+        validation(fit, [train, *validate]).savefig(asked.figure)
+    if asked.as_json:
+        print(json.dumps(as_dict(answer), indent=2))
+    else:
+        _show(answer)
+    return EXIT_OK
+
+
+def identify_vent(files: tuple[Path, ...], columns: tuple[str, ...], trained: int, *, as_json: bool) -> int:
+    """Fit the flow law to the ventings of the first `trained` files, score it on the others, and say it."""
+    if not 1 <= trained <= len(files):
+        raise BadConfig(f"--train {trained}: must be 1 to {len(files)}, the number of files")
+    mapped = parse_map(columns, ("time", "pressure"), ("input",))
+    runs = [read_vent(path, mapped) for path in files]
+    found = fit_vent(runs[:trained])
+    sure, (low, high) = found.uncertainty, found.uncertainty.interval()
+    own = dict(zip((r.name for r in runs), found.fits, strict=False))
+    scores = {r.name: score_vent(sure.values, r) for r in runs[trained:]}
+    if as_json:
+        rows = {n: {"value": v, "low": a, "high": b} for n, v, a, b in zip(sure.names, sure.values, low, high, strict=True)}
+        print(json.dumps({"parameters": rows, "train": own, "validate": scores, "rank": found.rank}, indent=2))
+        return EXIT_OK
+    for name, value, a, b in zip(sure.names, sure.values, low, high, strict=True):
+        print(f"{name} {value:.4g} (95 %: {a:.4g} to {b:.4g})")
+    print(f"area, laminar conductance, wall and volume: rank {found.rank} of 4; only ratios to the volume are identifiable")
+    for name, fit in own.items():
+        print(f"  {name} (trained) {fit:.2f} %")
+    for name, fit in scores.items():
+        print(f"  {name} (unseen) {fit:.2f} %")
+    return EXIT_OK
+
+
+def fitted(structure: Structure, train: Series, method: str, interval: str) -> tuple[Fit, Uncertainty]:
+    """A model by `oe`, `iv` or `ls`, with its uncertainty."""
+    if method == "oe":
+        fit = fit_output_error(structure, [train])
+        return fit, of_fit(fit, [train], interval)
+    if structure != bare_of(structure) or interval == "bootstrap":
+        raise BadConfig(f"--method {method} takes neither memory, delay, lag, --at-rest nor bootstrap; --method oe does")
+    ls = least_squares(structure, train)
+    found = ls if method == "ls" else instrumental_variables(structure, train, fit_output_error(structure, [train]).values[:-2])
+    return as_fit(found, train), of_regression(found, interval)
+
+
+def _data(asked: Asked) -> tuple[Series, list[Series]]:
+    """Training data, and the rest. Of logs, the first run's halves are Data1 and Data2; of CSV files, the first one trains."""
+    if bool(asked.runs) == bool(asked.csv):
+        raise BadConfig("identify needs either runs, or --csv FILE with --map, and not both")
+    if asked.csv:
+        columns = parse_map(asked.columns)
+        series = [read_csv(path, columns) for path in asked.csv]
+        return series[0], series[1:]
+    series = [from_log(open_log(find_log(run)), run.name) for run in asked.runs]
+    first, second = halves(series[0])
+    return first, [second, *series[1:]]
+
+
+def _structure(asked: Asked, inputs: int) -> Structure:
+    try:
+        m, n, r = (int(part) for part in asked.orders.split(","))
+    except ValueError:
+        raise BadConfig(f"--orders {asked.orders}: must be m,n,r such as 2,0,3") from None
+    if not all(0 <= order <= 6 for order in (m, n, r)):
+        raise BadConfig(f"--orders {asked.orders}: each order is 0 to 6")
+    return Structure(m, n, r, inputs, asked.hysteresis, asked.creep, asked.delay, asked.lag, asked.at_rest)
+
+
+def as_dict(answer: Answer) -> dict[str, Any]:
+    """All that was found, for programs."""
+    low, high = answer.uncertainty.interval()
+    sure = answer.uncertainty
+    rows = zip(sure.names, sure.values, sure.errors, low, high, strict=True)
+    return {
+        "structure": asdict(answer.fit.structure),
+        "intervals": sure.method,
+        "parameters": {n: {"value": v, "error": e, "low": a, "high": b} for n, v, e, a, b in rows},
+        "train": {answer.train.name: answer.fit.fits[0]},
+        "validate": answer.scores,
+    }
+
+
+def _show(answer: Answer) -> None:
+    console, sure = Console(highlight=False), answer.uncertainty
+    low, high = sure.interval()
+    paper = _table1() if answer.fit.structure.inputs == 1 else {}
+    shown = paper if set(PAPER.names) <= set(sure.names) else {}
+    table = Table(title=f"{answer.train.name}: 95 % intervals, {sure.method}")
+    for heading in ("parameter", "value", "low", "high", *(["Table 1", "printed interval"] if shown else [])):
+        table.add_column(heading, justify="right")
+    for i, name in enumerate(sure.names):
+        beside = [shown.get(name, ("", ""))[0], shown.get(name, ("", ""))[1]] if shown else []
+        table.add_row(name, f"{sure.values[i]:.5g}", f"{low[i]:.5g}", f"{high[i]:.5g}", *beside)
+    console.print(table)
+    print(f"fit by free simulation, NRMSE: {answer.train.name} (trained) {answer.fit.fits[0]:.2f} %")
+    for name, fit in answer.scores.items():
+        print(f"  {name} (unseen) {fit:.2f} %")
+
+
+def _table1() -> dict[str, tuple[str, str]]:
+    bending = load_parameters(shipped()).bending
+    entries = {name: getattr(bending, name) for name in PAPER.names}
+    return {name: (f"{e.value:.5g}", f"{e.min:.5g} to {e.max:.5g}") for name, e in entries.items()}
+
+
+def _select(structure: Structure, train: Series, validate: list[Series], *, as_json: bool) -> int:
+    with counted_progress("fitting structures", quiet=as_json) as progress:
+        choices = compare(structure, train, validate, progress)
+    if as_json:
+        print(json.dumps([asdict(c) for c in choices], indent=2))
+        return EXIT_OK
+    table = Table(title=f"orders, trained on {train.name}; fit by free simulation in %")
+    for heading in ("m, n, r", "values", train.name, *(v.name for v in validate), "Schwarz", "interval holds 0"):
+        table.add_column(heading, justify="right")
+    best = min(choices, key=lambda c: c.schwarz)
+    for c in choices:
+        s, mark = c.structure, " *" if c is best else ""
+        fits = [f"{f:.2f}" for f in (c.fit, *c.validation)]
+        table.add_row(f"{s.m}, {s.n}, {s.r}", str(len(s.names)), *fits, f"{c.schwarz:.4f}{mark}", " ".join(c.uncertain) or "-")
+    Console(highlight=False).print(table)
+    return EXIT_OK

@@ -1,0 +1,129 @@
+"""Series from CSV files measured elsewhere: which column is what is said by a map.
+
+A map names columns for `time`, `pressure` and `angle`. Several pressures are joined by commas, each then has a gain of its own.
+A column may be brought to s, kPa or deg by a factor: `time=t_ms*0.001`.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from softloop.offline.identification.series import LEAST_SAMPLES, Series
+from softloop.offline.identification.venting import Vent, vent_of
+from softloop.wire.errors import BadConfig, BadFile
+
+Floats = NDArray[np.float64]
+NEEDED = ("time", "pressure", "angle")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column's name and the factor that brings it to s, kPa or deg."""
+
+    name: str
+    factor: float = 1.0
+
+
+Map = dict[str, tuple[Column, ...]]
+
+
+def parse_map(entries: Sequence[str], needed: Sequence[str] = NEEDED, optional: Sequence[str] = ()) -> Map:
+    """`["time=t_s", "pressure=P1_kPa,P2_kPa", ...]` as a map. Raises BadConfig with one line."""
+    found: Map = {}
+    for entry in entries:
+        key, equals, columns = entry.partition("=")
+        if not equals or key not in (*needed, *optional) or not columns:
+            raise BadConfig(f"--map {entry}: must be KEY=COLUMN with KEY one of {', '.join((*needed, *optional))}")
+        found[key] = tuple(_column(text, entry) for text in columns.split(","))
+        if key != "pressure" and len(found[key]) != 1:
+            raise BadConfig(f"--map {entry}: only 'pressure' may have several columns")
+    missing = [key for key in needed if key not in found]
+    if missing:
+        raise BadConfig(f"--map: nothing given for {', '.join(missing)}; such as --map {missing[0]}=COLUMN")
+    return found
+
+
+def _column(text: str, entry: str) -> Column:
+    name, star, factor = text.partition("*")
+    try:
+        return Column(name.strip(), float(factor) if star else 1.0)
+    except ValueError:
+        raise BadConfig(f"--map {entry}: '{factor}' is no number") from None
+
+
+def read_csv(path: Path, columns: Map) -> Series:
+    """One file as a series. Raises BadFile: one line with file, row and fault."""
+    table = _table(path)
+    wanted = {c.name for group in columns.values() for c in group}
+    missing = sorted(wanted - set(table))
+    if missing:
+        raise BadFile(f"{path}: there is no column {', '.join(missing)}; there are: {', '.join(table)}")
+
+    def taken(key: str) -> list[Floats]:
+        return [table[c.name] * c.factor for c in columns[key]]
+
+    time_s = taken("time")[0]
+    series = Series(path.stem, time_s, np.stack(taken("pressure"), axis=1), taken("angle")[0])
+    _check(path, series)
+    return series
+
+
+def read_vent(path: Path, columns: Map) -> Vent:
+    """One file as a venting. Raises BadFile as `read_csv` does."""
+    table = _table(path)
+    missing = sorted({c.name for group in columns.values() for c in group} - set(table))
+    if missing:
+        raise BadFile(f"{path}: there is no column {', '.join(missing)}; there are: {', '.join(table)}")
+    taken = {key: table[group[0].name] * group[0].factor for key, group in columns.items()}
+    bad = np.flatnonzero(~np.isfinite(np.column_stack(list(taken.values()))).all(axis=1))
+    if len(bad):
+        raise BadFile(f"{path}: row {bad[0] + 2} holds no number where one is needed")
+    back = np.flatnonzero(np.diff(taken["time"]) <= 0)
+    if len(back):
+        raise BadFile(f"{path}: row {back[0] + 3}: time must rise from row to row")
+    return vent_of(path.stem, taken["time"], taken["pressure"], taken.get("input"))
+
+
+def _check(path: Path, series: Series) -> None:
+    if len(series.time_s) < LEAST_SAMPLES:
+        raise BadFile(f"{path}: {len(series.time_s)} rows; identification needs {LEAST_SAMPLES} or more")
+    values = np.column_stack([series.time_s, series.pressure_kpa, series.angle_deg])
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise BadFile(f"{path}: row {bad[0] + 2} holds no number where one is needed")
+    back = np.flatnonzero(np.diff(series.time_s) <= 0)
+    if len(back):
+        raise BadFile(f"{path}: row {back[0] + 3}: time must rise from row to row")
+    if not np.ptp(series.angle_deg) or not np.ptp(series.pressure_kpa, axis=0).all():
+        raise BadFile(f"{path}: angle or a pressure never changes, which says nothing about the actuator")
+
+
+def _table(path: Path) -> dict[str, Floats]:
+    """Column name -> values (n,); what is not a number becomes NaN."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = list(csv.reader(file))
+    except OSError as error:
+        raise BadFile(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise BadFile(f"{path}: not a CSV file in UTF-8: {error}") from None
+    if not rows:
+        raise BadFile(f"{path}: empty; a header and rows are needed")
+    header, body = [name.strip() for name in rows[0]], [row for row in rows[1:] if row]
+    for number, row in enumerate(body, 2):
+        if len(row) != len(header):
+            raise BadFile(f"{path}: row {number} has {len(row)} fields where the header has {len(header)}")
+    return {name: np.array([_number(row[i]) for row in body]) for i, name in enumerate(header)}
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")

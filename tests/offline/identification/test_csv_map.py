@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+
+from softloop.offline.identification.csv_map import parse_map, read_csv
+from softloop.wire.errors import BadConfig, BadFile
+
+MAP = ["time=t_ms*0.001", "pressure=p1,p2*100", "angle=bend"]
+
+
+def written(path, rows=60, edit=lambda lines: lines):
+    lines = ["t_ms,p1,p2,bend,note"]
+    lines += [f"{40 * i},{i % 7},{0.01 * (i % 5)},{np.sin(i):.4f},x" for i in range(rows)]
+    path.write_text("\n".join(edit(lines)) + "\n")
+    return path
+
+
+def test_columns_are_taken_as_mapped_with_their_factors(tmp_path):
+    series = read_csv(written(tmp_path / "run.csv"), parse_map(MAP))
+    assert series.name == "run"
+    assert series.time_s[1] == pytest.approx(0.04)
+    assert series.pressure_kpa.shape == (60, 2)
+    assert series.pressure_kpa[4].tolist() == pytest.approx([4.0, 4.0])
+
+
+@pytest.mark.parametrize(
+    ("entries", "fault"),
+    [
+        (["time=t"], "nothing given for pressure, angle"),
+        (["speed=t"], "KEY one of time, pressure, angle"),
+        (["time"], "KEY=COLUMN"),
+        (["time=a,b"], "only 'pressure'"),
+        (["time=a*x"], "'x' is no number"),
+    ],
+)
+def test_a_bad_map_is_one_clear_line(entries, fault):
+    with pytest.raises(BadConfig, match=fault):
+        parse_map(entries)
+
+
+@pytest.mark.parametrize(
+    ("edit", "fault"),
+    [
+        (lambda lines: lines[:20], "19 rows"),
+        (lambda lines: [*lines[:5], "1,2", *lines[6:]], "row 6 has 2 fields where the header has 5"),
+        (lambda lines: [*lines[:5], "160,a,0,1,x", *lines[6:]], "row 6 holds no number"),
+        (lambda lines: [*lines[:9], lines[8], *lines[10:]], "row 10: time must rise"),
+        (lambda lines: [x.replace("bend", "angle") for x in lines], "no column bend; there are: t_ms, p1, p2, angle, note"),
+        (lambda lines: lines[:1] + [f"{i},1,{i},{i},x" for i in range(60)], "never changes"),
+    ],
+)
+def test_a_bad_file_is_one_clear_line(tmp_path, edit, fault):
+    with pytest.raises(BadFile, match=fault):
+        read_csv(written(tmp_path / "run.csv", edit=edit), parse_map(MAP))
+
+
+def test_no_file_and_no_text_are_said(tmp_path):
+    with pytest.raises(BadFile, match="cannot be read"):
+        read_csv(tmp_path / "none.csv", parse_map(MAP))
+    (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(BadFile, match="not a CSV file"):
+        read_csv(tmp_path / "bytes.csv", parse_map(MAP))

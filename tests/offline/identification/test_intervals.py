@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+from models import measured, values_of
+from scipy.signal import lfilter
+
+from softloop.offline.identification.coverage import true_values
+from softloop.offline.identification.fitting import fit_output_error
+from softloop.offline.identification.intervals import _meat, autoregressive, between, information_rank, of_fit
+from softloop.offline.identification.output_error import Fit
+from softloop.offline.identification.structure import PAPER
+
+
+def test_an_autoregressive_process_is_found():
+    noise = lfilter([1.0], [1.0, -0.9, 0.2], 0.3 * np.random.RandomState(1).standard_normal(20_000))
+    coefficients, variance = autoregressive(noise)
+    assert coefficients[:3] == pytest.approx([1.0, -0.9, 0.2], abs=0.05)
+    assert variance == pytest.approx(0.09, rel=0.05)
+    white, _ = autoregressive(np.random.RandomState(2).standard_normal(20_000))
+    assert len(white) == 1
+
+
+def test_coloured_covariance_is_what_repetition_shows_and_white_is_not():
+    t = np.arange(4000) * 0.01
+    columns = np.stack([np.sin(t), np.cos(0.7 * t)], axis=1)
+    draws, claimed, naive = [], [], []
+    for seed in range(150):
+        error = lfilter([1.0], [1.0, -0.97], np.random.RandomState(seed).standard_normal(len(t)))
+        gain = np.linalg.inv(columns.T @ columns)
+        draws.append(gain @ columns.T @ error)
+        claimed.append(np.diag(gain @ _meat(error, columns, "coloured") @ gain))
+        naive.append(np.diag(gain @ _meat(error, columns, "white") @ gain))
+    scatter = np.var(draws, axis=0)
+    assert np.mean(claimed, axis=0) == pytest.approx(scatter, rel=0.35)
+    assert (np.mean(naive, axis=0) < 0.2 * scatter).all()
+
+
+def test_intervals_of_an_output_error_fit_hold_true_values():
+    held = []
+    for seed in range(12):
+        data = measured(PAPER, values_of(PAPER), seed=seed, seconds=25.0, noise_deg=0.1)
+        low, high = of_fit(fit_output_error(PAPER, [data]), [data], "coloured").interval()
+        held.append((low <= true_values()) & (true_values() <= high))
+    assert np.mean(held) > 0.85
+
+
+def test_bootstrap_is_repeatable_and_of_the_size_of_the_others():
+    data = measured(PAPER, values_of(PAPER), seconds=80.0, noise_deg=0.1)
+    fit = fit_output_error(PAPER, [data])
+    first, again, other = (of_fit(fit, [data], "bootstrap", seed) for seed in (1, 1, 2))
+    assert (first.covariance == again.covariance).all()
+    assert not (first.covariance == other.covariance).all()
+    assert first.degrees == 6.0
+    ratio = first.errors / of_fit(fit, [data], "white").errors
+    assert ((ratio > 0.2) & (ratio < 5.0)).all()
+
+
+def test_several_experiments_give_mean_and_spread():
+    values = np.array([[1.0, 2.0], [3.0, 2.0], [2.0, 2.0]])
+    fits = []
+    for row in values:
+        full = np.zeros(PAPER.size)
+        full[:2] = row
+        fits.append(Fit(PAPER, full, np.zeros((1, 2)), (0.0,)))
+    found = between(fits)
+    assert found.values[:2].tolist() == [2.0, 2.0]
+    assert found.errors[:2] == pytest.approx([1.0 / np.sqrt(3.0), 0.0])
+    assert found.degrees == 2.0
+
+
+def test_rank_says_what_cannot_be_told_apart():
+    column = np.random.RandomState(3).standard_normal((100, 1))
+    rank, relative = information_rank(np.hstack([column, 1e6 * column, np.ones((100, 1))]))
+    assert rank == 2
+    assert relative[0] == 1.0
