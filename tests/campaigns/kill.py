@@ -8,6 +8,7 @@ cut must be recovered, and no chunk may span a second. The disk is full by a lim
 files; it is lifted again, and nothing may be missing, or the recorder is killed, and all that the disk took must be there.
 """
 
+import faulthandler
 import json
 import random
 import resource
@@ -41,6 +42,7 @@ BENCH = "kill"
 LOST_NS = 1_000_000_000  # what a killed recorder may cost
 TICK_S = 0.005
 START_S = 30.0
+KILLS_PER_RIG = 40
 LANES = [(key(BENCH, c), message(c.message), c.name) for c in (PRESSURE, VALVES, CYCLE, TRUTH)]
 LANES += [(can_key(BENCH, "can0", 0x80), message("CanFrame"), ("can0", 0x80))]
 
@@ -74,7 +76,7 @@ class Sender:
 def rig():
     """A meeting point and a sender; gives (folder, endpoint, wire, sender)."""
     folder = Path(tempfile.mkdtemp(prefix="sl-kill-"))
-    zenoh = ZenohConfig(lease_ms=20_000, endpoint=f"unixsock-stream/{folder}/m.sock")
+    zenoh = ZenohConfig(mode="client", lease_ms=20_000, endpoint=f"unixsock-stream/{folder}/m.sock")
     try:
         with open_router(zenoh, BENCH), open_wire(zenoh, BENCH, "sender") as wire:
             sender = Sender(wire)
@@ -97,6 +99,8 @@ def recorder(endpoint, run_dir, wire, name, limit_bytes=0):
         end = time.monotonic() + START_S
         while name not in wire.processes_alive():
             if time.monotonic() > end or child.poll() is not None:
+                child.send_signal(signal.SIGUSR1)
+                time.sleep(0.5)
                 raise RuntimeError(f"the recorder did not start: {child.poll()} {(run_dir / 'said.txt').read_text()}")
             time.sleep(0.02)
         yield child
@@ -106,11 +110,12 @@ def recorder(endpoint, run_dir, wire, name, limit_bytes=0):
 
 
 def be_recorder(endpoint, run_dir, name, limit_bytes):
+    faulthandler.register(signal.SIGUSR1)
     stop = Stop()
     signal.signal(signal.SIGTERM, lambda *_: stop.set("SIGTERM"))
     if int(limit_bytes):
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit_bytes), resource.RLIM_INFINITY))
-    with open_wire(ZenohConfig(lease_ms=20_000, endpoint=endpoint), BENCH, name) as wire:
+    with open_wire(ZenohConfig(mode="client", lease_ms=20_000, endpoint=endpoint), BENCH, name) as wire:
         run(RecorderConfig(), Context(name, BENCH, Path(run_dir), wire, stop=stop))
 
 
@@ -229,9 +234,11 @@ def fill_once(outcome, rng, folder, endpoint, wire, sender, number):
 def campaign(kills, cuts, full, seed):
     """Run it; returns the outcome."""
     outcome, rng = Outcome("kill"), random.Random(seed)
+    for first in range(0, kills, KILLS_PER_RIG):
+        with rig() as (folder, endpoint, wire, sender):
+            for number in steps(range(first, min(kills, first + KILLS_PER_RIG)), "kills"):
+                kill_once(outcome, rng, folder, endpoint, wire, sender, number)
     with rig() as (folder, endpoint, wire, sender):
-        for number in steps(range(kills), "kills"):
-            kill_once(outcome, rng, folder, endpoint, wire, sender, number)
         for number in steps(range(full), "full disks"):
             fill_once(outcome, rng, folder, endpoint, wire, sender, number)
         cut_all(outcome, rng, finished_log(folder, endpoint, wire), cuts)
