@@ -197,7 +197,8 @@ def mcap(data):
     good.unlink(missing_ok=True)
     repair_log(file, good)
     again = open_log(good)
-    assert not [p for p in again.problems if "not finished" in p or "damaged" in p]
+    # A metadata record has no checksum: a damaged one is kept as it is.
+    assert not [p for p in again.problems if "not finished" in p or ("damaged" in p and "damaged metadata" not in p)]
     for name, records in log.channels.items():
         assert len(again[name]) >= len(records), f"{name} was lost by the repair"
 

@@ -8,7 +8,6 @@ cut must be recovered, and no chunk may span a second. The disk is full by a lim
 files; it is lifted again, and nothing may be missing, or the recorder is killed, and all that the disk took must be there.
 """
 
-import faulthandler
 import json
 import random
 import resource
@@ -29,19 +28,16 @@ from softloop.offline.log import open_log
 from softloop.offline.log_check import check_log
 from softloop.offline.log_repair import repair_log
 from softloop.offline.mcap_walk import RECORD, FileRecords
-from softloop.watch.config import RecorderConfig
-from softloop.watch.recorder import run
 from softloop.wire.channels import CYCLE, PRESSURE, TRUTH, VALVES, can_key, key
 from softloop.wire.config import ZenohConfig
 from softloop.wire.messages import message
 from softloop.wire.session import open_router, open_wire
-from softloop.wire.shell import Context, Stop
 from tests.campaigns.outcome import Outcome, options, steps
+from tests.campaigns.recorder_node import BENCH
 
-BENCH = "kill"
 LOST_NS = 1_000_000_000  # what a killed recorder may cost
 TICK_S = 0.005
-START_S = 30.0
+START_S = 120.0
 KILLS_PER_RIG = 40
 LANES = [(key(BENCH, c), message(c.message), c.name) for c in (PRESSURE, VALVES, CYCLE, TRUTH)]
 LANES += [(can_key(BENCH, "can0", 0x80), message("CanFrame"), ("can0", 0x80))]
@@ -92,31 +88,19 @@ def rig():
 def recorder(endpoint, run_dir, wire, name, limit_bytes=0):
     """A recorder in a process of its own, once it is alive; killed at the end at the latest."""
     run_dir.mkdir()
-    command = [sys.executable, "-m", "tests.campaigns.kill", "--be-recorder", endpoint, str(run_dir), name, str(limit_bytes)]
+    command = [sys.executable, "-m", "tests.campaigns.recorder_node", endpoint, str(run_dir), name, str(limit_bytes)]
     with (run_dir / "said.txt").open("w") as said:
         child = subprocess.Popen(command, stderr=said)
     try:
         end = time.monotonic() + START_S
         while name not in wire.processes_alive():
             if time.monotonic() > end or child.poll() is not None:
-                child.send_signal(signal.SIGUSR1)
-                time.sleep(0.5)
                 raise RuntimeError(f"the recorder did not start: {child.poll()} {(run_dir / 'said.txt').read_text()}")
             time.sleep(0.02)
         yield child
     finally:
         child.kill()
         child.wait()
-
-
-def be_recorder(endpoint, run_dir, name, limit_bytes):
-    faulthandler.register(signal.SIGUSR1)
-    stop = Stop()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set("SIGTERM"))
-    if int(limit_bytes):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit_bytes), resource.RLIM_INFINITY))
-    with open_wire(ZenohConfig(mode="client", lease_ms=20_000, endpoint=endpoint), BENCH, name) as wire:
-        run(RecorderConfig(), Context(name, BENCH, Path(run_dir), wire, stop=stop))
 
 
 def recovered(run_dir):
@@ -246,8 +230,6 @@ def campaign(kills, cuts, full, seed):
 
 
 def main():
-    if sys.argv[1:2] == ["--be-recorder"]:
-        return be_recorder(*sys.argv[2:])
     given = options(__doc__, kills=200, cuts=2000, full=20).parse_args()
     return campaign(given.kills, given.cuts, given.full, given.seed).finish(given.json)
 
