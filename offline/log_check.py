@@ -13,6 +13,7 @@ from softloop.offline.log import Log, Records
 from softloop.wire.channels import CAN
 from softloop.wire.mcap_layout import SENDER_FIELDS, Origin
 
+_NUMBERS = np.dtype([("seq", "<u8"), ("stamp_ns", "<i8"), ("node", "<u8")])
 JOINED_S = 0.01  # gaps so near each other are one stretch
 
 
@@ -76,8 +77,8 @@ class LogCheck:
 
 def check_log(log: Log) -> LogCheck:
     """Judge a log that was read. Stamps count from the start of the run, or from the first one where the log does not say it."""
-    named = [(name, records) for name, records in sorted(log.channels.items())]
-    frames = [(f"{CAN.name}/{bus}/{number:x}", records) for (bus, number), records in sorted(log.can.items())]
+    named = [(name, records) for name, records in sorted(log.channels.items()) if _counts(records)]
+    frames = [(f"{CAN.name}/{bus}/{number:x}", records) for (bus, number), records in sorted(log.can.items()) if _counts(records)]
     start_ns = _start_ns(log.origin, [records for _, records in named + frames])
     held = [_held(topic, records, start_ns) for topic, records in named + frames if len(records)]
     gaps, restarts = [], []
@@ -94,6 +95,11 @@ def check_log(log: Log) -> LogCheck:
         ends_s=max((h.last_s for h in held), default=0.0),
         finished=not any("not finished" in problem for problem in log.problems),
     )
+
+
+def _counts(records: Records, *more: str) -> bool:
+    """It has the fields that all our messages have; in a log of another layout, or a damaged one, it may not."""
+    return {"seq", "stamp_ns", *more} <= set(records.dtype.names or ())
 
 
 def _start_ns(origin: Origin | None, arrays: list[Records]) -> int:
@@ -115,15 +121,18 @@ def _sequences(log: Log, start_ns: int) -> Iterator[tuple[str, int, NDArray[Any]
     """Topic, sender, numbers and stamps of each sender that counts for itself, in the order of the log."""
     by_message = {"event": "Event", "status": "ProcessStatus", "request": "GateRequest"}
     for name, records in sorted(log.channels.items()):
-        yield from _of_senders(name, records, SENDER_FIELDS.get(by_message.get(name, "")), start_ns)
+        sender_field = SENDER_FIELDS.get(by_message.get(name, ""))
+        if _counts(records, *([sender_field] if sender_field else [])):
+            yield from _of_senders(name, records, sender_field, start_ns)
     for bus in sorted({bus for bus, _ in log.can}):
         # A node counts its frames over all identifiers of its bus, and has a new number when it starts anew.
-        frames = np.concatenate([_numbers(records) for (of, _), records in sorted(log.can.items()) if of == bus])
+        of_bus = [records for (of, _), records in sorted(log.can.items()) if of == bus and _counts(records, "node")]
+        frames = np.concatenate([_numbers(records) for records in of_bus] or [_numbers(np.zeros(0, _NUMBERS))])
         yield from _of_senders(f"{CAN.name}/{bus}", np.sort(frames, order=("node", "seq")), "node", start_ns)
 
 
 def _numbers(records: Records) -> Records:
-    kept = np.zeros(len(records), [("seq", "<u8"), ("stamp_ns", "<i8"), ("node", "<u8")])
+    kept = np.zeros(len(records), _NUMBERS)
     for name in kept.dtype.names or ():
         kept[name] = records[name]
     return kept

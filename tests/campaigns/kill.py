@@ -28,19 +28,17 @@ from softloop.offline.log import open_log
 from softloop.offline.log_check import check_log
 from softloop.offline.log_repair import repair_log
 from softloop.offline.mcap_walk import RECORD, FileRecords
-from softloop.watch.config import RecorderConfig
-from softloop.watch.recorder import run
 from softloop.wire.channels import CYCLE, PRESSURE, TRUTH, VALVES, can_key, key
 from softloop.wire.config import ZenohConfig
 from softloop.wire.messages import message
 from softloop.wire.session import open_router, open_wire
-from softloop.wire.shell import Context, Stop
 from tests.campaigns.outcome import Outcome, options, steps
+from tests.campaigns.recorder_node import BENCH
 
-BENCH = "kill"
 LOST_NS = 1_000_000_000  # what a killed recorder may cost
 TICK_S = 0.005
-START_S = 30.0
+START_S = 120.0
+KILLS_PER_RIG = 40
 LANES = [(key(BENCH, c), message(c.message), c.name) for c in (PRESSURE, VALVES, CYCLE, TRUTH)]
 LANES += [(can_key(BENCH, "can0", 0x80), message("CanFrame"), ("can0", 0x80))]
 
@@ -74,7 +72,7 @@ class Sender:
 def rig():
     """A meeting point and a sender; gives (folder, endpoint, wire, sender)."""
     folder = Path(tempfile.mkdtemp(prefix="sl-kill-"))
-    zenoh = ZenohConfig(lease_ms=20_000, endpoint=f"unixsock-stream/{folder}/m.sock")
+    zenoh = ZenohConfig(mode="client", lease_ms=20_000, endpoint=f"unixsock-stream/{folder}/m.sock")
     try:
         with open_router(zenoh, BENCH), open_wire(zenoh, BENCH, "sender") as wire:
             sender = Sender(wire)
@@ -90,7 +88,7 @@ def rig():
 def recorder(endpoint, run_dir, wire, name, limit_bytes=0):
     """A recorder in a process of its own, once it is alive; killed at the end at the latest."""
     run_dir.mkdir()
-    command = [sys.executable, "-m", "tests.campaigns.kill", "--be-recorder", endpoint, str(run_dir), name, str(limit_bytes)]
+    command = [sys.executable, "-m", "tests.campaigns.recorder_node", endpoint, str(run_dir), name, str(limit_bytes)]
     with (run_dir / "said.txt").open("w") as said:
         child = subprocess.Popen(command, stderr=said)
     try:
@@ -103,15 +101,6 @@ def recorder(endpoint, run_dir, wire, name, limit_bytes=0):
     finally:
         child.kill()
         child.wait()
-
-
-def be_recorder(endpoint, run_dir, name, limit_bytes):
-    stop = Stop()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set("SIGTERM"))
-    if int(limit_bytes):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit_bytes), resource.RLIM_INFINITY))
-    with open_wire(ZenohConfig(lease_ms=20_000, endpoint=endpoint), BENCH, name) as wire:
-        run(RecorderConfig(), Context(name, BENCH, Path(run_dir), wire, stop=stop))
 
 
 def recovered(run_dir):
@@ -229,9 +218,11 @@ def fill_once(outcome, rng, folder, endpoint, wire, sender, number):
 def campaign(kills, cuts, full, seed):
     """Run it; returns the outcome."""
     outcome, rng = Outcome("kill"), random.Random(seed)
+    for first in range(0, kills, KILLS_PER_RIG):
+        with rig() as (folder, endpoint, wire, sender):
+            for number in steps(range(first, min(kills, first + KILLS_PER_RIG)), "kills"):
+                kill_once(outcome, rng, folder, endpoint, wire, sender, number)
     with rig() as (folder, endpoint, wire, sender):
-        for number in steps(range(kills), "kills"):
-            kill_once(outcome, rng, folder, endpoint, wire, sender, number)
         for number in steps(range(full), "full disks"):
             fill_once(outcome, rng, folder, endpoint, wire, sender, number)
         cut_all(outcome, rng, finished_log(folder, endpoint, wire), cuts)
@@ -239,8 +230,6 @@ def campaign(kills, cuts, full, seed):
 
 
 def main():
-    if sys.argv[1:2] == ["--be-recorder"]:
-        return be_recorder(*sys.argv[2:])
     given = options(__doc__, kills=200, cuts=2000, full=20).parse_args()
     return campaign(given.kills, given.cuts, given.full, given.seed).finish(given.json)
 

@@ -1,0 +1,218 @@
+"""The boundaries of softloop, each as a function of bytes: whatever they are, it returns; what it must hold is asserted."""
+
+import contextlib
+import hashlib
+import math
+import os
+import tempfile
+from pathlib import Path
+from types import SimpleNamespace
+
+from softloop.deploy.bench import load_bench, shipped_benches
+from softloop.devices import gate as g
+from softloop.devices.config import InclinometerConfig
+from softloop.devices.protocols import can_frames, wt931
+from softloop.devices.protocols.can_frames import E2eReceiver, e2e_crc
+from softloop.devices.protocols.quantise import counts_to_deg
+from softloop.devices.valves import ValvesLoop
+from softloop.dynamics.parameters import load_parameters, shipped
+from softloop.offline.log import open_log
+from softloop.offline.log_check import check_log
+from softloop.offline.log_repair import repair_log
+from softloop.wire.can_frame import make_frame, pack_frame, unpack_frame
+from softloop.wire.channels import CHANNELS, COMMAND, key
+from softloop.wire.errors import SoftloopError
+from softloop.wire.mcap_layout import BadMessage, LogWriter, Origin
+from softloop.wire.messages import BadPayload, message, message_names
+from tests.devices.gate_bench import GateBench
+from tests.offline import synthetic
+
+FOLDER = Path(tempfile.mkdtemp(prefix="sl-fuzz-", dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
+WHOLE_CAN = b"\xff" * 8
+
+
+def can(data):
+    """Frames of any length into both receivers, and the payload of a frame on Zenoh."""
+    frame = unpack_frame(data)
+    if frame is not None:
+        assert unpack_frame(pack_frame(frame)) == frame
+    for data_id, decode in (
+        (can_frames.VALVE_COMMAND_ID, can_frames.decode_valve_command),
+        (can_frames.VALVE_STATUS_ID, can_frames.decode_valve_status),
+    ):
+        receiver = E2eReceiver(data_id, 4)
+        for at in range(0, max(1, len(data)), 8):
+            part = data[at : at + 8]
+            if receiver.judge(part).usable:
+                assert len(part) == 8
+                assert part[0] == e2e_crc(part, data_id), "a frame with a wrong CRC was let through"
+                assert 0 <= decode(part).counter < can_frames.COUNTER_STATES
+    if len(data) >= 8:
+        can_frames.decode_analog_inputs(data[:8])
+
+
+def can_corpus():
+    command = can_frames.encode_valve_command(can_frames.ValveCommandFrame(0, 1, 8000, 0, 1))
+    more = can_frames.encode_valve_command(can_frames.ValveCommandFrame(1, 1, 8000, 0, 2))
+    status = can_frames.encode_valve_status(can_frames.ValveStatusFrame(3, 0, 100, 200, 7))
+    return [command + more, status, pack_frame(make_frame(1, 2, 3, 0x80, command)), WHOLE_CAN]
+
+
+def new_sampler():
+    config = InclinometerConfig(port="x")
+    bounds = (config.rate_hz, config.max_rate_deg_s, config.noise_deg, config.max_acceleration_deg_s2, config.noise_deg_s)
+    return wt931.Sampler(wt931.sampler_config(*bounds), config.baud)
+
+
+def serial(data):
+    """Bytes of the serial line, in pieces, into the inclinometer's sampler and into the device's command parser."""
+    sampler, arrival_ns, at = new_sampler(), 1_000_000_000, 0
+    while at < len(data):
+        size = 1 + data[at] % 23
+        arrival_ns += 5_000_000
+        for sample in sampler.feed(data[at : at + size], arrival_ns):
+            assert math.isfinite(counts_to_deg(sample.angle_counts))
+            assert -32768 <= sample.rate_counts <= 32767
+            assert sample.stamp_ns <= arrival_ns
+        at += size
+    wt931.CommandParser().feed(data)
+
+
+def serial_corpus():
+    burst = b"".join(wt931.encode_packet(kind, (1, 2, 3, 4)) for kind in sorted(wt931.TYPES))
+    return [burst * 4, wt931.encode_unlock() + wt931.encode_command(3, 9), burst[:-3] + burst]
+
+
+class _Nowhere:
+    def __init__(self):
+        self.at = 0
+
+    def write(self, data):
+        self.at += len(data)
+
+    def tell(self):
+        return self.at
+
+
+_KINDS = [message(name) for name in message_names()]
+_ORIGIN = Origin("fuzz", 1, 0)
+_LOG = LogWriter(_Nowhere(), _ORIGIN, {})
+
+
+def _gates():
+    """A disarmed, an armed and a faulted gate behind the process's own reading of commands."""
+    for prepare in (lambda b: b.tick(), lambda b: b.armed(), lambda b: (b.armed(), b.tick(stop=1))):
+        bench = GateBench()
+        prepare(bench)
+        yield bench
+
+
+_PREPARED = [(b, b.state.copy(), b.given.copy()) for b in _gates()]
+
+
+def cdr(data):
+    """A payload on every channel: unpacked or refused; as a command at the gate it passes nothing that it must not."""
+    for kind in _KINDS:
+        with contextlib.suppress(BadPayload):
+            kind.unpack(data)
+    for channel in CHANNELS:
+        with contextlib.suppress(BadMessage):
+            _LOG.add(key("fuzz", channel), channel, data)
+    for bench, state, given in _PREPARED:
+        bench.state, bench.given = state.copy(), given.copy()
+        _ask(bench, data)
+
+
+def _ask(bench, data):
+    """Give `data` to a gate as its process would."""
+    now_ns = bench.now_ns + 5_000_000
+    loop = SimpleNamespace(
+        status=SimpleNamespace(dropped=0), commands=SimpleNamespace(take_all=list), given=bench.given, wait_ns=0, tick=0
+    )
+    bench.given.command_new = bench.given.stop = bench.given.arm = 0
+    ValvesLoop._take_newest(loop, data, now_ns)
+    bench.given.now_ns = bench.given.driver_stamp_ns = now_ns
+    before = int(bench.state.gate)
+    g.gate_step(bench.config, bench.state, bench.given, bench.output)
+    out = bench.output
+    assert out.gate == g.GATE_ARMED or (out.charge_counts == 0 and out.output != g.OUTPUT_PASS), "current without being armed"
+    assert before == g.GATE_ARMED or out.gate != g.GATE_ARMED, "armed by a command"
+    assert 0 <= out.charge_current_ma <= 220.0
+    assert 0 <= out.exhaust_current_ma <= 220.0
+
+
+def cdr_corpus():
+    kind = message(COMMAND.message)
+    near = _PREPARED[1][0].now_ns
+    good = kind.make(
+        seq=5000, pressure_stamp_ns=near, inclination_stamp_ns=near, angle_deg=70.0, charge_current_ma=100.0, ready=1
+    )
+    return [kind.pack(good)] + [k.pack(k.make(seq=1, stamp_ns=1)) for k in _KINDS]
+
+
+def one_line(read, file):
+    """A file is read, or refused in one line."""
+    refused = ""
+    try:
+        read(file)
+    except SoftloopError as error:
+        refused = str(error) or "\n"
+    assert "\n" not in refused, refused
+
+
+def bench(data):
+    """A bench file."""
+    file = FOLDER / "bench.toml"
+    file.write_bytes(data)
+    one_line(load_bench, file)
+
+
+def bench_corpus():
+    texts = [path.read_bytes() for path in shipped_benches().values() if b"base" not in path.read_bytes()]
+    return [*texts, b'name = "x"\n[can.a]\n[valves]\ncan = "a"\n[run]\nduration_s = 1\n']
+
+
+def parameters(data):
+    """A parameter file."""
+    file = FOLDER / "parameters.toml"
+    file.write_bytes(data)
+    one_line(load_parameters, file)
+
+
+def parameters_corpus():
+    return [shipped().read_bytes()]
+
+
+def mcap(data):
+    """A log: read and judged, one in sixteen also repaired and read again."""
+    file, good = FOLDER / "run.mcap", FOLDER / "good.mcap"
+    file.write_bytes(data)
+    try:
+        log = open_log(file)
+        check_log(log)
+    except SoftloopError:
+        return
+    if hashlib.blake2b(data, digest_size=1).digest()[0] % 16:
+        return
+    good.unlink(missing_ok=True)
+    repair_log(file, good)
+    again = open_log(good)
+    # A metadata record has no checksum: a damaged one is kept as it is.
+    assert not [p for p in again.problems if "not finished" in p or ("damaged" in p and "damaged metadata" not in p)]
+    for name, records in log.channels.items():
+        assert len(again[name]) >= len(records), f"{name} was lost by the repair"
+
+
+def mcap_corpus():
+    made = list(synthetic.messages(0.02))
+    files = []
+    for finish, size in ((True, 600), (False, 4000)):
+        files.append(synthetic.write_log(FOLDER / "seed.mcap", made, finish=finish, chunk_bytes=size).read_bytes())
+    return files
+
+
+TARGETS = {f.__name__: f for f in (can, serial, cdr, bench, parameters, mcap)}
+CORPORA = {
+    "can": can_corpus, "serial": serial_corpus, "cdr": cdr_corpus, "bench": bench_corpus, "parameters": parameters_corpus,
+    "mcap": mcap_corpus,
+}  # fmt: skip

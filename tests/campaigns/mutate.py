@@ -1,0 +1,156 @@
+"""Mutants of the safety gate and of the valve driver's watchdog: each must fail a test, or be justified in writing.
+
+    python -m tests.campaigns.mutate [--one-in 1] [--module gate] [--seed 1] [--json FILE]
+
+Kernels run as plain Python here. Each mutant lives in a process of its own, forked from one that has loaded all but the module in
+question and what imports it; the tests of that module run in it, until the first one fails. One that does not end in time counts
+as killed too, and is counted apart.
+"""
+
+import ast
+import contextlib
+import importlib
+import io
+import os
+import random
+import resource
+import signal
+import sys
+import types
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ["NUMBA_DISABLE_JIT"] = "1"  # before numba is loaded
+
+import hypothesis
+import numba  # noqa: F401 - this and what follows is loaded before the forks, for speed; none of it imports a target
+import pytest
+import scipy.optimize  # noqa: F401
+
+import softloop.devices.config
+import softloop.devices.protocols.quantise_kernels
+import softloop.devices.protocols.wt931
+import softloop.plant.config
+import softloop.plant.loads
+import softloop.plant.physics
+import softloop.plant.records
+import softloop.plant.truth
+import softloop.wire.can_config  # noqa: F401
+from tests.campaigns.justified import JUSTIFIED
+from tests.campaigns.mutants import mutants_of
+from tests.campaigns.outcome import Outcome, options, steps
+
+LIMIT_S = 60  # of processor time
+KILLED, SURVIVED = 1, 0
+
+
+@dataclass(frozen=True)
+class Target:
+    """A module under mutation, the functions in question, and the tests that must notice."""
+
+    module: str
+    functions: tuple
+    tests: tuple
+
+
+_QUICK = "not compiled_and_plain and not ten_minutes"  # the one starts processes, the other needs the compiler's speed
+TARGETS = {
+    "gate": Target(
+        "softloop.devices.gate",
+        (
+            "command_reason", "take_command", "driver_now", "condition", "arm_is_new", "change_state", "vent_output", "limited",
+            "gate_step",
+        ),
+        ("tests/devices/test_gate.py", "tests/devices/test_gate_sequences.py", "-k", _QUICK),
+    ),
+    "watchdog": Target(
+        "softloop.plant.electrical",
+        ("accept_command", "_frame_due_ns", "next_event_ns", "_drive", "_apply_frame", "_watchdog"),
+        ("tests/plant/test_watchdog.py",),
+    ),
+}  # fmt: skip
+
+
+def source_of(target):
+    spec = importlib.util.find_spec(target.module)
+    return Path(spec.origin), Path(spec.origin).read_text()
+
+
+def judge(target, tree, file):
+    """In a process of its own: load the mutant and run the tests. Returns KILLED, SURVIVED, or None for no end in time."""
+    child = os.fork()
+    if child == 0:
+        resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))
+        os._exit(_be_mutant(target, tree, file))
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if code == -signal.SIGXCPU:
+        return None
+    return SURVIVED if code == 0 else KILLED
+
+
+def _be_mutant(target, tree, file):
+    hypothesis.settings.register_profile("mutate", derandomize=True, database=None, print_blob=False)
+    hypothesis.settings.load_profile("mutate")
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        package, name = target.module.rsplit(".", 1)
+        module = types.ModuleType(target.module)
+        module.__file__, module.__package__ = str(file), package
+        sys.modules[target.module] = module
+        exec(compile(tree, str(file), "exec"), module.__dict__)
+        setattr(importlib.import_module(package), name, module)
+    except Exception:  # noqa: BLE001 - a mutant that cannot be loaded is dead
+        return KILLED
+    with contextlib.redirect_stdout(io.StringIO()):
+        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--no-header", *target.tests])
+    return SURVIVED if code == 0 else KILLED
+
+
+def campaign(names, one_in, seed):
+    """Judge every `one_in`-th mutant of the named targets, beginning at a place that `seed` gives."""
+    outcome = Outcome("mutate")
+    for name in names:
+        target = TARGETS[name]
+        file, source = source_of(target)
+        all_of_them = list(mutants_of(source, target.functions))
+        _check_justifications(outcome, name, {m.name for m in all_of_them})
+        chosen = all_of_them[random.Random(seed).randrange(one_in) :: one_in]
+        if judge(target, ast.parse(source), file) != SURVIVED:
+            outcome.fail(f"{name}: the tests fail without any mutant")
+            continue
+        for mutant in steps(chosen, name):
+            _count(outcome, name, mutant, judge(target, mutant.tree, file))
+    return outcome
+
+
+def _count(outcome, name, mutant, verdict):
+    outcome.count(f"mutants of {name}")
+    if verdict is None:
+        outcome.count(f"mutants of {name} that did not end")
+    elif verdict == KILLED:
+        outcome.count(f"mutants of {name} killed")
+    elif mutant.name in JUSTIFIED[name]:
+        outcome.count(f"mutants of {name} survived, justified")
+    else:
+        outcome.count(f"mutants of {name} survived")
+        outcome.fail(f"{name}: survived: {mutant.name}")
+        print(f"survived: {mutant.name}", file=sys.stderr, flush=True)
+
+
+def _check_justifications(outcome, name, there):
+    for gone in set(JUSTIFIED[name]) - there:
+        outcome.fail(f"{name}: a justification for a mutant that is none any more: {gone}")
+
+
+def main():
+    parser = options(__doc__, one_in=1)
+    parser.add_argument("--module", choices=[*TARGETS, "all"], default="all")
+    given = parser.parse_args()
+    names = list(TARGETS) if given.module == "all" else [given.module]
+    return campaign(names, given.one_in, given.seed).finish(given.json)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
