@@ -26,6 +26,7 @@ app = typer.Typer(
 )
 
 BenchArgument = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="A bench file, or the name of a shipped one (sim).")]
+OptionalBench = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="A bench file, or the name of a shipped one.")]
 RunDir = Annotated[Path, typer.Option(metavar="DIR", help="The run's directory.")]
 
 
@@ -125,6 +126,53 @@ def same(
     from softloop.deploy.same import same_runs
 
     return same_runs(first, second, as_json=as_json)
+
+
+@app.command()
+def plot(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory, or a log in it.")],
+    curves: Annotated[list[str], typer.Argument(metavar="CHANNEL.FIELD...", help="Such as cycle.angle_deg or cycle.theta[8].")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A file ending in .svg, .pdf or .png. Default: plot.svg beside the log.")
+    ] = None,
+    first: Annotated[float, typer.Option("--from", metavar="S", help="From S seconds after the start of the log.")] = float(
+        "-inf"
+    ),
+    last: Annotated[float, typer.Option("--to", metavar="S", help="Until then.")] = float("inf"),
+) -> int:
+    """Draw fields of a log against time, one panel per unit."""
+    from softloop.deploy.plotting import plot_run
+
+    return plot_run(run, curves, out, first, last)
+
+
+@app.command()
+def top(
+    bench: OptionalBench = Path("sim"),
+    seconds: Annotated[float | None, typer.Option(metavar="S", min=0.1, help="End after S seconds.")] = None,
+    once: Annotated[bool, typer.Option("--once", help="One look of two seconds (or --seconds), as plain text.")] = False,
+) -> int:
+    """Show a running bench: rates, ages, tick lateness, loads of buses and processes."""
+    from softloop.deploy.watching import top as show_top
+
+    return show_top(bench, seconds, once=once)
+
+
+@app.command()
+def echo(
+    channel: Annotated[
+        str, typer.Argument(metavar="CHANNEL", help="Such as cycle, cycle.angle_deg,error_deg, event or can/can0/80.")
+    ],
+    bench: OptionalBench = Path("sim"),
+    count: Annotated[int | None, typer.Option("--count", "-n", metavar="N", min=1, help="End after N messages.")] = None,
+    rate: Annotated[float | None, typer.Option(metavar="HZ", min=0.01, help="At most so many a second, each the newest.")] = None,
+    timeout: Annotated[float, typer.Option(metavar="S", min=0.0, help="Exit code 4 after S seconds without one; 0: wait.")] = 0.0,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line.")] = False,
+) -> int:
+    """Print the messages of a channel of a running bench."""
+    from softloop.deploy.watching import echo as print_channel
+
+    return print_channel(channel, bench, count, rate, timeout, json_lines=as_json)
 
 
 @app.command()
