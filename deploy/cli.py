@@ -37,6 +37,7 @@ def run(
     duration: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="End after S seconds, armed.")] = None,
     no_report: Annotated[bool, typer.Option("--no-report", help="Leave out the report at the end.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False,
+    page: Annotated[bool, typer.Option("--page", help="Serve the live page while the rig runs.")] = False,
     pace: Annotated[
         Literal["wall", "lockstep"] | None,
         typer.Option(help="Instead of the bench file's: by the clock, or tick by tick."),
@@ -46,7 +47,9 @@ def run(
     from softloop.deploy.bench import find_bench
     from softloop.deploy.launcher import Options, launch
 
-    options = Options(run_dir=run_dir, duration_s=duration, report=False if no_report else None, quiet=quiet, pace=pace)
+    options = Options(
+        run_dir=run_dir, duration_s=duration, report=False if no_report else None, quiet=quiet, pace=pace, page=page
+    )
     return launch(find_bench(bench), options)
 
 
@@ -156,6 +159,26 @@ def top(
     from softloop.deploy.watching import top as show_top
 
     return show_top(bench, seconds, once=once)
+
+
+@app.command()
+def page(
+    bench: OptionalBench = Path("sim"),
+    port: Annotated[int | None, typer.Option(metavar="N", min=0, max=65_534, help="Instead of [page] port.")] = None,
+    launch: Annotated[bool, typer.Option("--launch", help="Start and end experiments from the page.")] = False,
+) -> int:
+    """Serve the live page of a bench in a browser until Ctrl-C; the bench may be running already, come later, and come again."""
+    from softloop.deploy.page import page as serve_page
+
+    return serve_page(bench, port, launch=launch)
+
+
+@app.command(hidden=True)
+def bounds(bench: BenchArgument) -> int:
+    """The page's helper: the parameters and their bounds as JSON."""
+    from softloop.deploy.page import bounds as print_bounds
+
+    return print_bounds(bench)
 
 
 @app.command()
