@@ -50,7 +50,7 @@ class Chart {
         y: ofMode ? { auto: false, range: [0.5, 3.5] } : { range: (_u, low, high) => limits(low, high) },
       },
       axes: [
-        axis({ show: last, values: (_u, splits) => splits.map((s) => `${s}`), size: 28 }),
+        axis({ show: last, values: (_u, splits) => splits.map((s) => (s < 0 ? "" : `${s}`)), size: 28, grid: { show: false } }),
         axis({ size: 60, ...(ofMode ? { splits: [1, 2, 3], values: (_u, s) => s.map((v) => MODES[v]), grid: { show: false } } : { space: 28 }) }),
       ],
       series: [{}, ...curves.map(([, name, stroke, dashed]) => ({
