@@ -38,6 +38,7 @@ def run(
     no_report: Annotated[bool, typer.Option("--no-report", help="Leave out the report at the end.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False,
     page: Annotated[bool, typer.Option("--page", help="Serve the live page while the rig runs.")] = False,
+    foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve the channels to Foxglove while the rig runs.")] = False,
     pace: Annotated[
         Literal["wall", "lockstep"] | None,
         typer.Option(help="Instead of the bench file's: by the clock, or tick by tick."),
@@ -171,6 +172,19 @@ def page(
     from softloop.deploy.page import page as serve_page
 
     return serve_page(bench, port, launch=launch)
+
+
+@app.command()
+def foxglove(
+    bench: OptionalBench = Path("sim"),
+    port: Annotated[int | None, typer.Option(metavar="N", min=0, max=65_535, help="Instead of [foxglove] port.")] = None,
+    layout: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a layout for this bench, and end.")] = None,
+) -> int:
+    """Serve a running bench's channels to Foxglove and Lichtblick on this machine until Ctrl-C (extra 'foxglove')."""
+    from softloop.deploy.foxglove import foxglove as serve_foxglove
+    from softloop.deploy.foxglove import write_layout
+
+    return serve_foxglove(bench, port) if layout is None else write_layout(bench, layout)
 
 
 @app.command(hidden=True)

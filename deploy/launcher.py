@@ -54,6 +54,7 @@ class Options:
     quiet: bool = False
     pace: Literal["wall", "lockstep"] | None = None
     page: bool = False
+    foxglove: bool = False
 
 
 def launch(bench_file: Path, options: Options) -> int:
@@ -84,7 +85,8 @@ def launch(bench_file: Path, options: Options) -> int:
 
 def onlookers(run_dir: Path, options: Options) -> list[list[str]]:
     """The commands that look at the run from outside."""
-    return [[name, str(run_dir / BENCH_FILE)] for name, asked in (("page", options.page),) if asked]
+    asked = (("page", options.page), ("foxglove", options.foxglove))
+    return [[name, str(run_dir / BENCH_FILE)] for name, wanted in asked if wanted]
 
 
 def _with_options(bench: Bench, options: Options) -> Bench:

@@ -18,7 +18,7 @@ const CHARTS = [
 // Round limits around what is seen, so that the scale stands still while the curve moves.
 function limits(low, high) {
   if (!(low <= high)) return [0, 1];
-  const span = Math.max(high - low, 1e-3, Math.abs(high) * 1e-3);
+  const span = Math.max(high - low, 0.1, Math.abs(high) * 1e-3);
   const step = 10 ** Math.floor(Math.log10(span)) / 2;
   return [Math.floor((low - 0.04 * span) / step) * step, Math.ceil((high + 0.04 * span) / step) * step];
 }
