@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from softloop.offline.log import find_log, open_log
-from softloop.offline.plot import curve, plot, save
+from softloop.offline.plot import curve, plot
+from softloop.offline.vector import save
 from softloop.wire.errors import EXIT_OK
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -17,7 +16,6 @@ from softloop.offline.figures import BLACK, BLUE, GREEN, ORANGE, RED, SKY, STYLE
 from softloop.offline.log import Log
 from softloop.wire.errors import BadConfig, BadFile
 
-FORMATS = ("svg", "pdf", "png")
 COLORS = (BLUE, ORANGE, GREEN, RED, SKY, BLACK)
 POINTS_MAX = 20_000  # of one curve in the picture; more cannot be seen
 PANEL_IN = 2.3
@@ -122,17 +120,3 @@ def _draw(axis: Axes, unit: str, curves: list[Curve]) -> None:
     axis.set_ylabel(unit or "value")
     columns = 1 if len(curves) > 3 else len(curves)
     axis.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=max(columns, 3), borderaxespad=0.2, handlelength=1.6)
-
-
-def save(figure: Figure, target: Path) -> Path:
-    """Write a figure in the format of the file's ending; equal figures give equal bytes. Raises BadConfig, BadFile."""
-    ending = target.suffix.removeprefix(".").lower()
-    if ending not in FORMATS:
-        raise BadConfig(f"{target}: the ending says the format, one of: {', '.join('.' + f for f in FORMATS)}")
-    metadata: Any = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {"Software": None}}[ending]
-    try:
-        with mpl.rc_context({"svg.hashsalt": "softloop", "svg.fonttype": "none", "pdf.fonttype": 42}):
-            figure.savefig(target, format=ending, metadata=metadata)
-    except OSError as error:
-        raise BadFile(f"{target}: cannot be written: {error.strerror or error}") from None
-    return target

@@ -8,6 +8,8 @@ DESKTOP = {"width": 1360, "height": 1180}
 PHONE = {"width": 360, "height": 740}
 LIVE = "document.body.dataset.connection === 'live' && softloop.store.count > 20"
 PATIENCE_MS = 30_000
+# What the browser itself says when a server goes away.
+LOST = ("ERR_CONNECTION_REFUSED", "WebSocket connection", "ERR_CONNECTION_RESET", "ERR_EMPTY_RESPONSE", "503")
 
 
 def wait_for(view, expression):

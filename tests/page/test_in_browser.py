@@ -7,14 +7,12 @@ import time
 import numpy as np
 import pytest
 
-from tests.page.browsing import LIVE, PHONE, viewing, wait_for
+from tests.page.browsing import LIVE, LOST, PHONE, viewing, wait_for
 from tests.watch.benches import speaking, write_bench
 from tests.watch.pages import served, toy_rig, until
 from tests.wire.rendezvous import short_folder
 
 pytestmark = pytest.mark.page
-
-LOST = ("ERR_CONNECTION_REFUSED", "WebSocket connection", "ERR_CONNECTION_RESET", "ERR_EMPTY_RESPONSE", "503")
 
 
 @pytest.fixture(scope="module")

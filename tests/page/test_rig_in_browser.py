@@ -10,7 +10,7 @@ from softloop.deploy.bench import shipped_benches
 from softloop.offline.log import open_log
 from softloop.watch.page.history import COLUMNS
 from softloop.wire.messages import constant
-from tests.page.browsing import PHONE, viewing, wait_for
+from tests.page.browsing import LOST, PHONE, viewing, wait_for
 from tests.rig.rigs import running
 from tests.rig.test_whole_rig import WIDE
 
@@ -28,12 +28,13 @@ def address_of(rig):
     return rig.output.split(word)[1].split()[0]
 
 
-def test_what_the_page_shows_is_logged_and_its_stop_vents(chromium, request):
+def test_what_the_page_shows_is_logged_and_its_stop_vents(chromium, request, tmp_path):
     shots = request.config.getoption("--screenshots")
-    text = f'base = "{shipped_benches()["sim"]}"\n[page]\nport = 0\n{WIDE}'
+    waves_csv(tmp_path / "waves.csv")
+    text = f'base = "{shipped_benches()["sim"]}"\n[page]\nport = 0\n{WIDE}[controller]\ntrajectory = "{tmp_path}/waves.csv"\n'
     with running(text, name="seen-rig", arguments=("--page", "--no-report")) as rig:
         address = address_of(rig)
-        with viewing(chromium, address) as view:
+        with viewing(chromium, address, allow=LOST) as view:
             wait_for(view, TRACKED)
             rows = np.array(view.evaluate(ALL_KEPT))
             start_ns = view.evaluate("softloop.state.start_ns")
@@ -54,6 +55,13 @@ def test_what_the_page_shows_is_logged_and_its_stop_vents(chromium, request):
     vented_ms = vent_delay_ms(log, pressed_ns)
     print(f"from the press to the first vent frame: {vented_ms:.1f} ms")
     assert 0 < vented_ms < LIMIT_MS
+
+
+def waves_csv(target):
+    """A trajectory that lasts until somebody presses the button, also on a machine that is busy."""
+    times = np.arange(0, 90.01, 0.05)
+    angle_deg = 75 + 25 * np.sin(2 * np.pi * times / 12) + 8 * np.sin(2 * np.pi * times / 3.1)
+    np.savetxt(target, np.c_[times, angle_deg], delimiter=",", header="t_s,angle_deg")
 
 
 def compare_rows(rows, start_ns, cycles):

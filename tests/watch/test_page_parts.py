@@ -23,7 +23,9 @@ START_NS = 10**12
 
 
 def cycle(i, **values):
-    return message("CycleRecord").make(seq=i + 1, stamp_ns=START_NS + 5_000_000 * i, angle_deg=0.1 * i, mode=i % 3, **values)
+    return message("CycleRecord").make(
+        seq=i + 1, stamp_ns=START_NS + 5_000_000 * i, angle_deg=0.1 * i, mode=i % 3, **{"phase": 2} | values
+    )
 
 
 def unpacked(data):
@@ -58,6 +60,14 @@ def test_a_rig_clock_that_goes_back_begins_a_new_history():
     history.append([cycle(0), cycle(1)])
     assert (history.epoch, history.head) == (1, 2)
     assert history.rows(0, 2)[1, 0] == pytest.approx(0.005)
+
+
+def test_while_the_controller_waits_nothing_is_asked():
+    history = History(10)
+    history.append([cycle(0, phase=0, reference_deg=0.0), cycle(1, phase=1, reference_deg=30.0)])
+    reference = history.rows(0, 2)[:, COLUMNS.index("reference_deg")]
+    assert np.isnan(reference[0])
+    assert reference[1] == 30.0
 
 
 def headers(**given):

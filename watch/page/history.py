@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from softloop.wire.messages import constant
+
 # Name in the page -> how it is taken from a cycle record. The first is the time, s since the history began.
 COLUMNS = (
     "time_s",
@@ -23,6 +25,9 @@ COLUMNS = (
     "mode",
 )
 _TAKEN = COLUMNS[1:]
+_WAIT = constant("CycleRecord", "PHASE_WAIT")
+# What the controller has no word on while it waits.
+_ASKED = [COLUMNS.index(name) for name in ("reference_deg", "error_deg", "desired_pressure_kpa")]
 _HEAD = struct.Struct("<IId")  # rows, columns, time that the rows' times count from
 
 
@@ -62,6 +67,8 @@ class History:
             row = self._rows[self.head % len(self._rows)]
             row[0] = (cycle.stamp_ns - self._start_ns) * 1e-9
             row[1:] = [getattr(cycle, name) for name in _TAKEN]
+            if cycle.phase == _WAIT:
+                row[_ASKED] = np.nan
             self.head += 1
 
     def rows(self, first: int, last: int) -> NDArray[np.float64]:

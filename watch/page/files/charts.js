@@ -19,7 +19,7 @@ const CHARTS = [
 function limits(low, high) {
   if (!(low <= high)) return [0, 1];
   const span = Math.max(high - low, 0.1, Math.abs(high) * 1e-3);
-  const step = 10 ** Math.floor(Math.log10(span)) / 2;
+  const step = 10 ** Math.floor(Math.log10(span)) / 4;
   return [Math.floor((low - 0.04 * span) / step) * step, Math.ceil((high + 0.04 * span) / step) * step];
 }
 
@@ -50,7 +50,7 @@ class Chart {
         y: ofMode ? { auto: false, range: [0.5, 3.5] } : { range: (_u, low, high) => limits(low, high) },
       },
       axes: [
-        axis({ show: last, values: (_u, splits) => splits.map((s) => (s < 0 ? "" : `${s}`)), size: 28, grid: { show: false } }),
+        axis({ show: last, values: (_u, splits) => splits.map((s) => (s < 0 ? "" : `${s}`)), size: 28, grid: { show: false }, ticks: { show: false } }),
         axis({ size: 60, ...(ofMode ? { splits: [1, 2, 3], values: (_u, s) => s.map((v) => MODES[v]), grid: { show: false } } : { space: 28 }) }),
       ],
       series: [{}, ...curves.map(([, name, stroke, dashed]) => ({

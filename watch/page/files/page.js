@@ -1,6 +1,6 @@
 // The page: its connection, its buttons, and the frame that draws what came.
 import { Charts } from "./charts.js";
-import { Panels, make } from "./panels.js";
+import { Panels, make, showLaw } from "./panels.js";
 import { Store } from "./store.js";
 
 const $ = (id) => document.getElementById(id);
@@ -161,7 +161,7 @@ function experimentState(state) {
   $("start").disabled = state.running;
   $("end").disabled = !state.running;
   if ($("experiment-state").textContent !== state.text) $("experiment-state").textContent = state.text;
-  if (state.law) $("law").textContent = `${state.law} on ${state.trajectory}`;
+  if (state.law) showLaw(state);
 }
 
 $("experiment-form").addEventListener("submit", async (event) => {

@@ -26,7 +26,7 @@ export class Panels {
     this.hello = hello;
     this.budgets = hello.budgets_ms || {};
     text("bench", hello.bench || "softloop");
-    text("law", [hello.law, hello.trajectory].filter(Boolean).join(" on "));
+    showLaw(hello);
     document.title = `${hello.bench || ""} softloop`;
     this.numbers = rowsOf($("numbers"), NUMBERS.map(([name]) => name), "dt", "dd");
     NUMBERS.forEach(([, , kind], i) => kind && this.numbers[i].classList.add(kind));
@@ -122,6 +122,12 @@ export class Panels {
       return line;
     }));
   }
+}
+
+// Which law on which trajectory; of a file its name alone.
+export function showLaw({ law, trajectory }) {
+  text("law", [law, trajectory && trajectory.split("/").pop()].filter(Boolean).join(" on "));
+  $("law").title = trajectory || "";
 }
 
 function place01(value, min, max) {
