@@ -151,6 +151,17 @@ def plot(
 
 
 @app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN RUN...", help="Run directories, or logs in them; two to six.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the page and its pictures go.")] = Path("compare"),
+) -> int:
+    """Lay several runs over each other: one page with their figures, pictures and what differs in their set-up."""
+    from softloop.deploy.comparing import compare_runs
+
+    return compare_runs(runs, out)
+
+
+@app.command()
 def top(
     bench: OptionalBench = Path("sim"),
     seconds: Annotated[float | None, typer.Option(metavar="S", min=0.1, help="End after S seconds.")] = None,

@@ -16,8 +16,9 @@ table { border-collapse: collapse; width: 100%; font-size: .9rem; }
 th, td { text-align: left; padding: .28rem .7rem .28rem 0; border-bottom: 1px solid #eee; vertical-align: top; }
 td.value { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
 th.value { text-align: right; }
+span.key { white-space: normal; }
 td.remark { color: #666; }
-td.key { font-family: ui-monospace, "DejaVu Sans Mono", monospace; font-size: .8rem; overflow-wrap: anywhere; }
+td.key, span.key { font-family: ui-monospace, "DejaVu Sans Mono", monospace; font-size: .8rem; overflow-wrap: anywhere; }
 .verdict { padding: .55rem .9rem; border-left: 4px solid #009e73; background: #f1f8f5; margin: 1rem 0; }
 .verdict.bad { border-color: #d55e00; background: #fdf3ec; }
 figure { margin: 1.4rem 0; }
@@ -29,7 +30,7 @@ summary { cursor: pointer; color: #0072b2; }
   body { max-width: none; margin: 0; font-size: 10.5pt; }
   figure, tr, .verdict { break-inside: avoid; }
   h2 { break-after: avoid; }
-  details > summary { display: none; }
+  .screen { display: none; }
 }
 @page { size: A4; margin: 16mm; }
 """

@@ -50,8 +50,7 @@ def page_of(log: Log, summary: dict[str, Any], pictures: list[tuple[str, bytes]]
         _headline(summary),
         "<h2>Pictures</h2>",
         *(picture(caption, data) for caption, data in pictures),
-        "<h2>All figures</h2>",
-        _all_figures(summary),
+        f'<section class="screen"><h2>All figures</h2>{_all_figures(summary)}</section>',
         "<h2>Provenance</h2>",
         _provenance(log),
     ]
