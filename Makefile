@@ -9,12 +9,15 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.softloop-is-installed
 SOURCES := wire dynamics devices plant controller watch offline deploy tests benchmarks docs
 
-.PHONY: help setup demo test exact lint lock clean
+CHROMIUM ?= /usr/bin/chromium
+
+.PHONY: help setup demo test exact test-page kill mutate fuzz lint lock clean
 
 help:
 	@echo 'make demo   set up, then run the two demonstration trajectories on the simulated rig'
 	@echo 'make test   set up, then all tests'
 	@echo 'make exact  set up, then the three exactness contracts for every law, with both cores kept busy'
+	@echo 'make test-page  the live page in a real browser (Debian: apt install chromium)'
 	@echo 'make lint   ruff, mypy and the rules of who may import whom'
 	@echo 'make lock   compute requirements.lock again from pyproject.toml'
 	@echo 'make clean  remove the environment, caches and built files; runs/ stays'
@@ -38,8 +41,14 @@ demo: $(STAMP)
 # Tests of a whole rig come last and one at a time: they need the machine for themselves.
 test: $(STAMP)
 	$(BIN)/softloop warm
-	$(BIN)/python -m pytest -m 'not rig and not exact'
-	$(BIN)/python -m pytest -m rig
+	$(BIN)/python -m pytest -m 'not rig and not exact and not page'
+	$(BIN)/python -m pytest -m 'rig and not page'
+
+# The live page in Debian's chromium, a whole rig behind it in the last tests; other browsers by CHROMIUM=PATH.
+test-page: $(STAMP)
+	@test -x '$(CHROMIUM)' || { echo 'make: no browser at $(CHROMIUM); install chromium, or make CHROMIUM=PATH' >&2; exit 3; }
+	$(BIN)/softloop warm
+	$(BIN)/python -m pytest tests/page --chromium '$(CHROMIUM)'
 
 exact: $(STAMP)
 	$(BIN)/softloop warm
@@ -54,7 +63,7 @@ lint: $(STAMP)
 lock: $(STAMP)
 	test -x $(BIN)/uv || $(BIN)/python -m pip install --quiet --disable-pip-version-check uv
 	$(BIN)/uv pip compile --quiet --universal --generate-hashes --no-emit-index-url --no-header \
-		--extra dev --output-file requirements.lock pyproject.toml
+		--extra dev --extra docs --extra foxglove --output-file requirements.lock pyproject.toml
 
 clean:
 	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis src/*.egg-info

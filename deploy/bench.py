@@ -21,7 +21,7 @@ from softloop.controller.config import ControllerConfig
 from softloop.deploy.config import RunConfig
 from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig, pressures_process, valves_process
 from softloop.plant.config import PlantConfig, plant_process
-from softloop.watch.config import RecorderConfig
+from softloop.watch.config import FoxgloveConfig, PageConfig, RecorderConfig
 from softloop.wire.benchfile import Table, load_model, read_toml, validated
 from softloop.wire.can_config import CanConfig
 from softloop.wire.config import HostConfig, PaceConfig, ZenohConfig
@@ -51,6 +51,8 @@ class Bench(Table):
     inclinometer: InclinometerConfig | None = None
     controller: ControllerConfig | None = None
     recorder: RecorderConfig | None = None
+    page: PageConfig = PageConfig()
+    foxglove: FoxgloveConfig = FoxgloveConfig()
 
 
 @dataclass(frozen=True)

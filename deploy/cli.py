@@ -30,6 +30,7 @@ app.add_typer(log_app, name="log")
 
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run directory, or a log in it.")]
 BenchArgument = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="A bench file, or the name of a shipped one (sim).")]
+OptionalBench = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="A bench file, or the name of a shipped one.")]
 RunDir = Annotated[Path, typer.Option(metavar="DIR", help="The run's directory.")]
 
 
@@ -40,6 +41,8 @@ def run(
     duration: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="End after S seconds, armed.")] = None,
     no_report: Annotated[bool, typer.Option("--no-report", help="Leave out the report at the end.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False,
+    page: Annotated[bool, typer.Option("--page", help="Serve the live page while the rig runs.")] = False,
+    foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve the channels to Foxglove while the rig runs.")] = False,
     pace: Annotated[
         Literal["wall", "lockstep"] | None,
         typer.Option(help="Instead of the bench file's: by the clock, or tick by tick."),
@@ -49,7 +52,9 @@ def run(
     from softloop.deploy.bench import find_bench
     from softloop.deploy.launcher import Options, launch
 
-    options = Options(run_dir=run_dir, duration_s=duration, report=False if no_report else None, quiet=quiet, pace=pace)
+    options = Options(
+        run_dir=run_dir, duration_s=duration, report=False if no_report else None, quiet=quiet, pace=pace, page=page
+    )
     return launch(find_bench(bench), options)
 
 
@@ -256,6 +261,97 @@ def coverage(
     from softloop.deploy.coverage import coverage as count
 
     return count(layer, rigs, first_seed, output, as_json=as_json)
+
+
+@app.command()
+def plot(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory, or a log in it.")],
+    curves: Annotated[list[str], typer.Argument(metavar="CHANNEL.FIELD...", help="Such as cycle.angle_deg or cycle.theta[8].")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A file ending in .svg, .pdf or .png. Default: plot.svg beside the log.")
+    ] = None,
+    first: Annotated[float, typer.Option("--from", metavar="S", help="From S seconds after the start of the log.")] = float(
+        "-inf"
+    ),
+    last: Annotated[float, typer.Option("--to", metavar="S", help="Until then.")] = float("inf"),
+) -> int:
+    """Draw fields of a log against time, one panel per unit."""
+    from softloop.deploy.plotting import plot_run
+
+    return plot_run(run, curves, out, first, last)
+
+
+@app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN RUN...", help="Run directories, or logs in them; two to six.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the page and its pictures go.")] = Path("compare"),
+) -> int:
+    """Lay several runs over each other: one page with their figures, pictures and what differs in their set-up."""
+    from softloop.deploy.comparing import compare_runs
+
+    return compare_runs(runs, out)
+
+
+@app.command()
+def top(
+    bench: OptionalBench = Path("sim"),
+    seconds: Annotated[float | None, typer.Option(metavar="S", min=0.1, help="End after S seconds.")] = None,
+    once: Annotated[bool, typer.Option("--once", help="One look of two seconds (or --seconds), as plain text.")] = False,
+) -> int:
+    """Show a running bench: rates, ages, tick lateness, loads of buses and processes."""
+    from softloop.deploy.watching import top as show_top
+
+    return show_top(bench, seconds, once=once)
+
+
+@app.command()
+def page(
+    bench: OptionalBench = Path("sim"),
+    port: Annotated[int | None, typer.Option(metavar="N", min=0, max=65_534, help="Instead of [page] port.")] = None,
+    launch: Annotated[bool, typer.Option("--launch", help="Start and end experiments from the page.")] = False,
+) -> int:
+    """Serve the live page of a bench in a browser until Ctrl-C; the bench may be running already, come later, and come again."""
+    from softloop.deploy.page import page as serve_page
+
+    return serve_page(bench, port, launch=launch)
+
+
+@app.command()
+def foxglove(
+    bench: OptionalBench = Path("sim"),
+    port: Annotated[int | None, typer.Option(metavar="N", min=0, max=65_535, help="Instead of [foxglove] port.")] = None,
+    layout: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a layout for this bench, and end.")] = None,
+) -> int:
+    """Serve a running bench's channels to Foxglove and Lichtblick on this machine until Ctrl-C (extra 'foxglove')."""
+    from softloop.deploy.foxglove import foxglove as serve_foxglove
+    from softloop.deploy.foxglove import write_layout
+
+    return serve_foxglove(bench, port) if layout is None else write_layout(bench, layout)
+
+
+@app.command(hidden=True)
+def bounds(bench: BenchArgument) -> int:
+    """The page's helper: the parameters and their bounds as JSON."""
+    from softloop.deploy.page import bounds as print_bounds
+
+    return print_bounds(bench)
+
+
+@app.command()
+def echo(
+    channel: Annotated[
+        str, typer.Argument(metavar="CHANNEL", help="Such as cycle, cycle.angle_deg,error_deg, event or can/can0/80.")
+    ],
+    bench: OptionalBench = Path("sim"),
+    count: Annotated[int | None, typer.Option("--count", "-n", metavar="N", min=1, help="End after N messages.")] = None,
+    rate: Annotated[float | None, typer.Option(metavar="HZ", min=0.01, help="At most so many a second, each the newest.")] = None,
+    timeout: Annotated[float, typer.Option(metavar="S", min=0.0, help="Exit code 4 after S seconds without one; 0: wait.")] = 0.0,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line.")] = False,
+) -> int:
+    """Print the messages of a channel of a running bench."""
+    from softloop.deploy.watching import echo as print_channel
+
+    return print_channel(channel, bench, count, rate, timeout, json_lines=as_json)
 
 
 @app.command()

@@ -12,6 +12,7 @@ from types import FrameType
 from typing import Literal
 
 from softloop.deploy.bench import Bench, load_bench
+from softloop.deploy.beside import beside
 from softloop.deploy.children import Child, Children
 from softloop.deploy.conclude import conclude
 from softloop.deploy.gate_requests import Requests, ask
@@ -53,6 +54,8 @@ class Options:
     report: bool | None = None
     quiet: bool = False
     pace: Literal["wall", "lockstep"] | None = None
+    page: bool = False
+    foxglove: bool = False
 
 
 def launch(bench_file: Path, options: Options) -> int:
@@ -71,10 +74,20 @@ def launch(bench_file: Path, options: Options) -> int:
         keep_bench(run_dir, bench)
         with compile_progress(quiet=options.quiet) as progress:
             prepared = prepare_in_child(run_dir / BENCH_FILE, run_dir, stop, progress)
-        with launcher_wire(bench) as wire, closing(make_view(prepared.trajectory_s, quiet=options.quiet)) as view:
+        with (
+            launcher_wire(bench) as wire,
+            closing(make_view(prepared.trajectory_s, quiet=options.quiet)) as view,
+            beside(onlookers(run_dir, options), run_dir, view.say),
+        ):
             kind = Launch if bench.pace.mode == "wall" else LockstepLaunch
             outcome = kind(bench, run_dir, wire, view, stop, Children(), prepared.trajectory_s).run()
         return conclude(bench, run_dir, outcome.code, outcome.text, began=outcome.began, quiet=options.quiet)
+
+
+def onlookers(run_dir: Path, options: Options) -> list[list[str]]:
+    """The commands that look at the run from outside."""
+    asked = (("page", options.page), ("foxglove", options.foxglove))
+    return [[name, str(run_dir / BENCH_FILE)] for name, wanted in asked if wanted]
 
 
 def _with_options(bench: Bench, options: Options) -> Bench:

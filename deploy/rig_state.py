@@ -24,6 +24,7 @@ PHASES = names_of("CycleRecord", "PHASE_")
 LOADS = {1: "payload", 2: "contact"}
 FAULTS = names_of("Event", "FAULT_")
 _KINDS = names_of("Event", "KIND_")
+_SOURCE_NAMES = {constant("Event", p.source): p.name for p in PROCESSES}
 
 
 class RigState:
@@ -35,7 +36,6 @@ class RigState:
         self._pressures = wire.latest(PRESSURE)
         self._statuses = wire.inbox(STATUS)
         self._events = wire.inbox(EVENT)
-        self._source_names = {constant("Event", p.source): p.name for p in PROCESSES}
         self.cycle: Any = None
         self.valves: Any = None
         self.pressure: Any = None
@@ -54,8 +54,8 @@ class RigState:
             self.was_armed |= self.valves is not None and self.valves.gate != GATE_DISARMED
         for _, payload in self._statuses.take_all():
             status = _newest(payload, "ProcessStatus", None)
-            if status is not None and status.process in self._source_names:
-                self.statuses[self._source_names[status.process]] = status
+            if status is not None and status.process in _SOURCE_NAMES:
+                self.statuses[_SOURCE_NAMES[status.process]] = status
         events = (_newest(payload, "Event", None) for _, payload in self._events.take_all())
         return [self.event_line(event) for event in events if event is not None]
 
@@ -92,8 +92,12 @@ class RigState:
 
     def event_line(self, event: Any) -> str:
         """An event in words, such as `valves: gate fault (sensor stale)`."""
-        who = self._source_names.get(event.source, "launcher")
-        return f"{who}: {_event_text(event)}"
+        return event_line(event)
+
+
+def event_line(event: Any) -> str:
+    """An event in words, such as `valves: gate fault (sensor stale)`."""
+    return f"{_SOURCE_NAMES.get(event.source, 'launcher')}: {_event_text(event)}"
 
 
 def reason_text(reason: int) -> str:

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from softloop.offline.campaign import PAPER, Group, Result
-from softloop.offline.figures import BLUE, GREEN, GREY, ORANGE, RED, SKY, STYLE, new_figure
+from softloop.offline.figures import BLUE, GREEN, GREY, ORANGE, RED, SKY, STYLE, make_figure
 
 _COLORS = (BLUE, ORANGE, GREEN, SKY, RED)
 PANEL_IN = 2.7
@@ -22,7 +22,7 @@ def distribution(results: Sequence[Result]) -> Figure:
     with mpl.rc_context(STYLE):
         trajectories = list(dict.fromkeys(r.case.trajectory for r in results))
         laws = list(dict.fromkeys(r.case.law for r in results))
-        figure, axes = new_figure(0.5 + PANEL_IN * len(trajectories), len(trajectories))
+        figure, axes = make_figure(0.5 + PANEL_IN * len(trajectories), len(trajectories))
         for axis, trajectory in zip(axes, trajectories, strict=True):
             _panel(axis, trajectory, laws, [r for r in results if r.case.trajectory == trajectory])
         axes[-1].set_xlabel("largest error on the trajectory (°)")

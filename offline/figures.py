@@ -46,7 +46,8 @@ _LATENESS_MARKS: Any = (("p50", "median", "-"), ("p99", "99 %", "--"), ("p99_9",
 _APPROACH = constant("CycleRecord", "PHASE_APPROACH")
 
 
-def new_figure(height_in: float, rows: int, **options: Any) -> tuple[Figure, list[Axes]]:
+def make_figure(height_in: float, rows: int, **options: Any) -> tuple[Figure, list[Axes]]:
+    """An empty figure of the report's width and its axes, top to bottom."""
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, 1, squeeze=False, **options)
@@ -97,7 +98,7 @@ def _mark_approach(axes: list[Axes], cycles: Records, start_ns: int) -> None:
 @_styled
 def tracking(log: Log, summary: dict[str, Any]) -> Figure:
     """(a) result, (b) control modes, (c) error with the paper's figures, (d) control inputs: as the paper's Figs. 6 and 7."""
-    figure, axes = new_figure(9.6, 4, sharex=True, height_ratios=(3.0, 1.0, 2.4, 2.0))
+    figure, axes = make_figure(9.6, 4, sharex=True, height_ratios=(3.0, 1.0, 2.4, 2.0))
     cycles, start_ns = _shown_cycles(log)
     _mark_approach(axes, cycles, start_ns)
     _draw_result(axes[0], log, cycles, start_ns)
@@ -187,7 +188,7 @@ def _draw_currents(axis: Axes, cycles: Records, start_ns: int) -> None:
 @_styled
 def pressures(log: Log, summary: dict[str, Any]) -> Figure:
     """Chamber pressure, true and measured, with the desired one; the supply below."""
-    figure, axes = new_figure(4.6, 2, sharex=True, height_ratios=(3.0, 1.2))
+    figure, axes = make_figure(4.6, 2, sharex=True, height_ratios=(3.0, 1.2))
     cycles, start_ns = _shown_cycles(log)
     _mark_approach(axes, cycles, start_ns)
     measured, truth = _between(log["pressure"], cycles), _between(log["truth"], cycles)
@@ -209,7 +210,7 @@ def pressures(log: Log, summary: dict[str, Any]) -> Figure:
 @_styled
 def lateness(log: Log, summary: dict[str, Any]) -> Figure:
     """How late ticks woke: a histogram, both axes logarithmic, because what matters is the rare late one."""
-    figure, [axis] = new_figure(2.9, 1)
+    figure, [axis] = make_figure(2.9, 1)
     late_ms = np.maximum(metrics.lateness_us(log) * 1e-3, _LATENESS_LEAST_MS)
     if late_ms.size:
         edges = np.geomspace(0.9 * float(late_ms.min()), 1.1 * float(late_ms.max()), 90)
@@ -229,7 +230,7 @@ def lateness(log: Log, summary: dict[str, Any]) -> Figure:
 @_styled
 def latency(log: Log, summary: dict[str, Any]) -> Figure:
     """Sensor to coil, hop by hop: columns to the median, lines to the 99th percentile."""
-    figure, [axis] = new_figure(3.4, 1)
+    figure, [axis] = make_figure(3.4, 1)
     labels = [
         "sensor\nto adapter",
         "in\nadapter",

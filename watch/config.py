@@ -1,8 +1,10 @@
-"""`[recorder]` of the bench file."""
+"""`[recorder]`, `[page]` and `[foxglove]` of the bench file."""
 
 from __future__ import annotations
 
-from pydantic import Field
+from ipaddress import ip_address
+
+from pydantic import Field, model_validator
 
 from softloop.wire.benchfile import Table
 
@@ -17,3 +19,39 @@ class RecorderConfig(Table):
     backlog_messages: int = Field(100_000, ge=1, le=10_000_000, description="messages waiting; beyond it the oldest go")
     unwritten_mib: int = Field(64, ge=1, le=4096, description="bytes the disk did not take yet; beyond it new messages go")
     drain_s: float = Field(3.0, ge=0, le=60, description="time allowed at the end for what is still waiting")
+
+
+class PageConfig(Table):
+    """`[page]`: the live page in a browser, served by `softloop page` and `softloop run --page`."""
+
+    host: str = Field(
+        "127.0.0.1", min_length=1, description="address to listen on; another than loopback needs the next three keys"
+    )
+    certificate: str = Field("", description="TLS: path of the certificate chain, PEM")
+    key: str = Field("", description="TLS: path of its private key, PEM")
+    token_file: str = Field("", description="path of a file with the token that a viewer has to bring, 16 characters or more")
+    port: int = Field(8420, ge=0, le=65_534, description="0: a free one; the emergency stop has the next port for itself")
+    history_s: float = Field(600.0, ge=1, le=3600, description="how much of the past a new viewer gets")
+
+    @model_validator(mode="after")
+    def _guarded(self) -> PageConfig:
+        if bool(self.certificate) != bool(self.key):
+            raise ValueError("certificate and key come together")
+        if not self.loopback and not (self.certificate and self.token_file):
+            raise ValueError(f"host {self.host} is not loopback: TLS and a token are needed (certificate, key and token_file)")
+        return self
+
+    @property
+    def loopback(self) -> bool:
+        """Nobody outside this machine can reach it."""
+        try:
+            return self.host == "localhost" or ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+
+class FoxgloveConfig(Table):
+    """`[foxglove]`: the channels for Foxglove and Lichtblick, served on loopback by `softloop foxglove` and `run --foxglove`."""
+
+    port: int = Field(8765, ge=0, le=65_535, description="0: a free one")
+    rate_hz: float = Field(50.0, gt=0, le=1000, description="a faster channel is thinned to this; events and requests never")

@@ -10,11 +10,10 @@ import synthetic
 
 from softloop.offline import figures
 from softloop.offline.log import open_log
-from softloop.offline.report import make_report, png_of
+from softloop.offline.report import make_report
 from softloop.offline.summary import MEANINGS, summarise
+from softloop.offline.vector import as_bytes
 from softloop.wire.errors import BadFile
-
-PNG = b"\x89PNG\r\n\x1a\n"
 
 
 class Page(html.parser.HTMLParser):
@@ -53,17 +52,18 @@ def text(run):
 
 def test_the_page_and_its_pictures_are_there(run, text):
     names = {p.name for p in run.iterdir()}
-    pictures = {f"{name}.png" for name, _, _ in figures.PICTURES}
-    assert names == {"run.mcap", "report.html", "summary.json", *pictures}
+    pictures = {f"{name}.svg" for name, _, _ in figures.PICTURES}
+    assert names == {"run.mcap", "report.html", "summary.json", *pictures, *(p.replace(".svg", ".pdf") for p in pictures)}
     page = Page(text)
     assert page.tags.count("img") == len(pictures)
     for name, address in zip([p[0] for p in figures.PICTURES], page.addresses, strict=True):
-        assert base64.b64decode(address.removeprefix("data:image/png;base64,")) == (run / f"{name}.png").read_bytes()
-        assert (run / f"{name}.png").read_bytes().startswith(PNG)
+        assert base64.b64decode(address.removeprefix("data:image/svg+xml;base64,")) == (run / f"{name}.svg").read_bytes()
+        assert (run / f"{name}.svg").read_bytes().startswith(b"<?xml")
+        assert (run / f"{name}.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_the_page_asks_for_nothing_from_anywhere(text):
-    outside = re.sub(r"data:image/png;base64,[A-Za-z0-9+/=]+", "", text)
+    outside = re.sub(r"data:image/svg\+xml;base64,[A-Za-z0-9+/=]+", "", text)
     assert not re.search(r"https?:|//[a-z]|@import|url\(|<script|<link", outside)
     assert "default-src 'none'" in text
 
@@ -89,7 +89,7 @@ def test_text_of_the_log_cannot_become_markup(tmp_path, monkeypatch):
 def test_the_same_log_gives_the_same_picture(run):
     log = open_log(run / "run.mcap")
     summary = summarise(log)
-    assert png_of(figures.tracking(log, summary)) == (run / "tracking.png").read_bytes()
+    assert as_bytes(figures.tracking(log, summary), "svg") == (run / "tracking.svg").read_bytes()
 
 
 LOGS = {

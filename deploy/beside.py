@@ -1,0 +1,60 @@
+"""Commands that look at a run from outside while it lasts: the page, the Foxglove bridge."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from softloop.deploy.children import PROGRAM, Child
+
+END_S = 5.0
+FIRST_WORD_S = 20.0
+POLL_S = 0.2
+
+
+@contextlib.contextmanager
+def beside(commands: list[list[str]], run_dir: Path, say: Callable[[str], None]) -> Iterator[None]:
+    """Run `softloop COMMAND` for each while the block lasts, its words in `COMMAND.log`, the first one said.
+
+    The run does not depend on them: one that cannot start, or ends, is said and no more.
+    """
+    started = [_start(command, run_dir / f"{command[0]}.log") for command in commands]
+    try:
+        for child in started:
+            threading.Thread(target=_say_first_word, args=(child, say), daemon=True).start()
+        yield
+    finally:
+        for child in started:
+            child.popen.terminate()
+        for child in started:
+            _wait(child)
+
+
+def _start(command: list[str], log: Path) -> Child:
+    with log.open("wb") as output:
+        popen = subprocess.Popen(
+            [*PROGRAM, *command], stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
+        )
+    return Child(command[0], popen, log)
+
+
+def _say_first_word(child: Child, say: Callable[[str], None]) -> None:
+    end = time.monotonic() + FIRST_WORD_S
+    while time.monotonic() < end:
+        word = child.last_line()
+        if word:
+            say(word)
+            return
+        time.sleep(POLL_S)
+
+
+def _wait(child: Child) -> None:
+    try:
+        child.popen.wait(END_S)
+    except subprocess.TimeoutExpired:
+        child.popen.kill()
+        child.popen.wait()

@@ -1,0 +1,86 @@
+"""The page beside a whole rig: what it shows is what is logged, and its stop button vents, by the log."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softloop.deploy.bench import shipped_benches
+from softloop.offline.log import open_log
+from softloop.watch.page.history import COLUMNS
+from softloop.wire.messages import constant
+from tests.page.browsing import LOST, PHONE, viewing, wait_for
+from tests.rig.rigs import running
+from tests.rig.test_whole_rig import WIDE
+
+pytestmark = [pytest.mark.page, pytest.mark.rig]
+
+LIMIT_MS = 100.0
+OUTPUT_VENT, GATE_FAULT = constant("ValveStatus", "OUTPUT_VENT"), constant("ValveStatus", "GATE_FAULT")
+TRACKED = "softloop.state && softloop.state.phase === 'track' && softloop.state.trajectory_s > 12"
+ALL_KEPT = "(() => { const v = softloop.store.levels[0].since(softloop.store.last - 8); return v.map((c) => [...c]); })()"
+
+
+def address_of(rig):
+    word = "live page: "
+    rig.wait_for_word(word)
+    return rig.output.split(word)[1].split()[0]
+
+
+def test_what_the_page_shows_is_logged_and_its_stop_vents(chromium, request, tmp_path):
+    shots = request.config.getoption("--screenshots")
+    waves_csv(tmp_path / "waves.csv")
+    text = f'base = "{shipped_benches()["sim"]}"\n[page]\nport = 0\n{WIDE}[controller]\ntrajectory = "{tmp_path}/waves.csv"\n'
+    with running(text, name="seen-rig", arguments=("--page", "--no-report")) as rig:
+        address = address_of(rig)
+        with viewing(chromium, address, allow=LOST) as view:
+            wait_for(view, TRACKED)
+            rows = np.array(view.evaluate(ALL_KEPT))
+            start_ns = view.evaluate("softloop.state.start_ns")
+            if shots:
+                view.screenshot(path=Path(shots) / "page.png")
+            box = view.locator("#stop").bounding_box()
+            view.mouse.move(box["x"] + 20, box["y"] + 20)
+            pressed_ns = time.monotonic_ns()
+            view.mouse.down()
+            assert rig.finish() == 1
+            wait_for(view, "document.body.dataset.connection === 'lost'")
+            assert view.evaluate("softloop.state.gate.state") in ("fault", "silent")
+            if shots:
+                view.set_viewport_size(PHONE)
+                view.screenshot(path=Path(shots) / "page_lost_phone.png")
+        log = open_log(rig.run_dir / "run.mcap")
+    compare_rows(rows, start_ns, log["cycle"])
+    vented_ms = vent_delay_ms(log, pressed_ns)
+    print(f"from the press to the first vent frame: {vented_ms:.1f} ms")
+    assert 0 < vented_ms < LIMIT_MS
+
+
+def waves_csv(target):
+    """A trajectory that lasts until somebody presses the button, also on a machine that is busy."""
+    times = np.arange(0, 90.01, 0.05)
+    angle_deg = 75 + 25 * np.sin(2 * np.pi * times / 12) + 8 * np.sin(2 * np.pi * times / 3.1)
+    np.savetxt(target, np.c_[times, angle_deg], delimiter=",", header="t_s,angle_deg")
+
+
+def compare_rows(rows, start_ns, cycles):
+    """The rows of the page are logged cycles, and their values those of the log to the precision of f32.
+
+    On a busy machine page and recorder each lose some records of their own; those that both have are compared.
+    """
+    stamps = cycles["stamp_ns"]
+    wanted = start_ns + rows[0] * 1e9
+    at = np.minimum(np.searchsorted(stamps, wanted - 2_500_000), len(stamps) - 1)
+    both = np.abs(stamps[at] - wanted) < 2_000
+    assert both.sum() > 800
+    assert both.mean() > 0.8
+    for column, values in zip(COLUMNS[1:], rows[1:], strict=True):
+        np.testing.assert_allclose(values[both], cycles[column][at[both]], rtol=1e-6, atol=1e-6)
+
+
+def vent_delay_ms(log, pressed_ns):
+    valves = log["valves"]
+    after = valves[(valves["stamp_ns"] > pressed_ns) & (valves["gate"] == GATE_FAULT) & (valves["output"] == OUTPUT_VENT)]
+    assert (after["reason"] == constant("ValveStatus", "REASON_EMERGENCY_STOP")).all()
+    return (after["stamp_ns"][0] - pressed_ns) * 1e-6

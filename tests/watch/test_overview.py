@@ -1,0 +1,73 @@
+"""Rates, gaps, loads and lateness from messages that are made up."""
+
+import numpy as np
+import pytest
+
+from softloop.watch.overview import LATE_EDGES_US, Overview
+from softloop.wire.channels import CYCLE, EVENT, PRESSURE, STATUS, can_key, key
+from softloop.wire.messages import message
+
+BENCH = "b"
+
+
+def made(name, **values):
+    return message(name).pack(message(name).make(**values))
+
+
+def overview():
+    return Overview(BENCH, {"can0": 500_000}, {4: "recorder"}, lambda dlc, bitrate: (47 + 8 * dlc) * 1_000_000_000 // bitrate)
+
+
+def pressures(first, last):
+    return [(key(BENCH, PRESSURE), made("PressureSample", seq=seq)) for seq in range(first, last)]
+
+
+def test_a_rate_is_counted_over_the_window_only():
+    seen = overview()
+    for look in range(41):
+        seen.take(pressures(1 + 10 * look, 11 + 10 * look), now_s=0.1 * look)
+    assert seen.lanes[key(BENCH, PRESSURE)].rate_hz == pytest.approx(100.0)
+    seen.take([], now_s=6.0)
+    seen.take([], now_s=8.0)
+    assert seen.lanes[key(BENCH, PRESSURE)].rate_hz == 0.0
+
+
+def test_gaps_are_counted_and_several_senders_are_no_gap():
+    seen = overview()
+    seen.take(pressures(1, 5) + pressures(8, 10), 1.0)
+    assert seen.lanes[key(BENCH, PRESSURE)].missing == 3
+    seen.take([(key(BENCH, EVENT), made("Event", seq=seq)) for seq in (1, 7, 2)], 1.0)
+    assert seen.lanes[key(BENCH, EVENT)].missing == 0
+    assert [e.seq for e in seen.events] == [1, 7, 2]
+
+
+def test_the_load_of_a_bus_is_the_time_its_frames_stand_on_it():
+    seen = overview()
+    frames = [(can_key(BENCH, "can0", 0x80), made("CanFrame", seq=1, dlc=8)) for _ in range(450)]
+    seen.take([], 0.0)
+    seen.take(frames, 1.0)
+    assert seen.buses["can0"].load_percent == pytest.approx(450 * (47 + 64) / 500_000 * 100)
+
+
+def test_lateness_is_of_ticks_and_early_ones_count_as_on_time():
+    seen = overview()
+    late_ns = [-5_000, 15_000, 1_500_000]
+    seen.take(
+        [(key(BENCH, CYCLE), made("CycleRecord", seq=i + 1, stamp_ns=10**9, woken_ns=10**9 + n)) for i, n in enumerate(late_ns)]
+    )
+    histogram = seen.lateness_histogram()
+    assert sum(histogram) == 3
+    assert histogram[0] == 1
+    assert histogram[int(np.searchsorted(LATE_EDGES_US, 1500.0)) - 1] == 1
+    assert seen.lateness_spread_us()["max"] == pytest.approx(1500.0)
+    assert len(seen.cycles) == 3
+
+
+def test_a_status_goes_by_the_name_of_its_process_and_rubbish_is_counted():
+    seen = overview()
+    seen.take([(key(BENCH, STATUS), made("ProcessStatus", process=4, pid=7)), (key(BENCH, CYCLE), b"rubbish")], 3.0)
+    assert seen.statuses["recorder"][0].pid == 7
+    assert seen.statuses["recorder"][1] == 3.0
+    assert seen.malformed == 1
+    seen.take([("softloop/other/cycle", b"x"), ("softloop/b/nothing", b"x")], 3.0)
+    assert len(seen.lanes) == 2

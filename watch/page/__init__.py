@@ -1,0 +1,1 @@
+"""The live page: a running bench in a browser."""
