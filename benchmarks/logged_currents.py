@@ -108,7 +108,7 @@ def _check_ends(log: Log, end_ns: np.ndarray) -> None:
 def of_closed_loop(layer: str, seed: int = 1) -> Currents:
     """T2 with the default law in one process; every tick's frame ends at the same time after it."""
     plant = PlantConfig.model_validate({"layer": layer, "seed": seed})
-    cycles: Any = simulate_run(ControllerConfig(trajectory="t2"), plant, LOOP_NS).cycles
+    cycles: Any = simulate_run(ControllerConfig(trajectory="t2"), plant).cycles
     assert cycles.dtype == CYCLE
     charge, exhaust = (
         np.array([counts_to_current(current_to_counts(float(ma))) for ma in cycles[name]])
