@@ -95,6 +95,7 @@ def _try(params: Any, state: Any, step_s: float, half_decay: float) -> None:
     slopes(params, state, middle_in, middle_out)
     _next_stage(params, state, step_s / 3.0, 0.5 * step_s)
     slopes(params, state, middle_in, middle_out)
+    state.push_middle[0], state.push_middle[1] = state.push[0], state.push[1]
     _next_stage(params, state, step_s / 3.0, step_s)
     end_in = play(charge + charge_off * decay, state.play_charge_ma, width_in)
     end_out = play(exhaust + exhaust_off * decay, state.play_exhaust_ma, width_out)
