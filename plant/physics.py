@@ -172,7 +172,7 @@ def block_kpa(params: Any, state: Any) -> float:
 
 @kernel(_F8(_F8, _F8, _F8, _F8, _F8))
 def slip_s(coil_ma: float, command_ma: float, held_ma: float, half_width_ma: float, lag_s: float) -> float:
-    """When from now on the coil's transient begins to move the play; inf when it does not, or does so already but for rounding."""
+    """When from now on the coil's transient begins to move the play; inf when it does not, or already does."""
     off, edge = coil_ma - command_ma, held_ma - half_width_ma
     if off < 0.0:
         edge = held_ma + half_width_ma
