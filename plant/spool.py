@@ -39,9 +39,12 @@ def turn(before: float, middle: float, after: float) -> float:
     if before * after >= 0.0:
         return 1.0
     slope, bend = 4.0 * middle - 3.0 * before - after, 2.0 * (before + after) - 4.0 * middle
+    if before > 0.0:
+        before, slope, bend = -before, -slope, -bend
     root = sqrt(slope * slope - 4.0 * bend * before)
-    share = -2.0 * before / (slope + root if before < 0.0 else slope - root)
-    return share if share > _SMALLEST_SHARE else 1.0
+    # Of the two forms of the root, the one whose sum does not cancel; where the slope is not positive, the bend is.
+    share = -2.0 * before / (slope + root) if slope > 0.0 else (root - slope) / (2.0 * bend)
+    return min(share, 1.0) if share > _SMALLEST_SHARE else 1.0
 
 
 @kernel(types.Tuple((_F8, _F8))(_F8, STATE_TYPE, _I8, _F8))
