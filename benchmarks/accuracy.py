@@ -1,50 +1,62 @@
-"""How exact is the plant's integration? Replays one sequence of currents with different steps.
+"""How exact is the plant's integration? Replays the valve currents of T2 runs, with their frames' ends, with different steps.
 
 - ideal layer: against scipy's DOP853 (rtol 1e-10) on the controller's own equations, restarted at every change of the currents
   and wherever a valve meets a stop;
 - rig layer, without noise: against itself at a twentieth of the step.
 
 Replayed currents control nothing: an error that was made once is carried along, and on some rigs grows, because the block's
-pressure pushes the charge valve open. The last column says by how much a small error at 0.5 s has grown at its worst.
+pressure pushes the charge valve open. The last column says by how much a small error at 0.5 s of the trajectory has grown at its
+worst. The replay begins with the rig at rest, before the approach, and ends 60 s after the trajectory's start.
 
-    python benchmarks/accuracy.py [SECONDS]
+    python benchmarks/accuracy.py [RUN ...] [--seconds 60]
+
+Without a RUN (a run's directory, or its log) it makes four at wall pace first: the ideal layer, and the rig layer's seeds 1 to 3.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from crude_tracking import Currents, apply, track
+from logged_currents import Currents, apply, make_run, of_log
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
 from scipy.integrate import solve_ivp
 
 from softloop.dynamics.bending import bending_acceleration
 from softloop.dynamics.parameters import KV1_CHARGE, KV1_EXHAUST, KV6_CHARGE, KV6_EXHAUST, load_parameters, model_record, shipped
 from softloop.dynamics.pneumatics import pressure_rate
 from softloop.dynamics.valve import g3, g4
+from softloop.offline.log import find_log, open_log
 from softloop.plant.config import PlantConfig
 from softloop.plant.physics import advance
 from softloop.plant.records import ANGLE, CHAMBER, TUBE
 from softloop.plant.setup import new_device, new_state, plant_record
+from softloop.wire.errors import SoftloopError
 
 SECONDS = 60.0
 STEPS_US = (1000.0, 500.0, 250.0, 100.0)
-NUDGED_FRAME, NUDGE_KPA = 100, 1e-5
+NUDGE_S, NUDGE_KPA = 0.5, 1e-5
+RUNS = (("ideal", 1), ("rig", 1), ("rig", 2), ("rig", 3))
 IDEAL_LIMITS = (1e-3, 1e-2)  # deg, kPa
 RIG_LIMITS = (5e-3, 5e-2)
 
 
-def replay(layer: str, currents: Currents, step_ns: int, seed: int = 1, nudge_kpa: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Angle (deg) and chamber pressure (kPa) at each frame's end, before it takes effect; at 0.5 s `nudge_kpa` is added."""
-    config = PlantConfig.model_validate({"layer": layer, "seed": seed})
-    params = plant_record(config)
+def replay(currents: Currents, step_ns: int, nudge_kpa: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Angle (deg) and chamber pressure (kPa) at each frame's end, before it takes effect; at `NUDGE_S` `nudge_kpa` is added."""
+    params = plant_record(currents.plant)
     params.step_ns = step_ns
-    state = new_state(params, new_device(config), 0)
+    state = new_state(params, new_device(currents.plant), 0)
     angle, pressure = np.zeros(len(currents.end_ns)), np.zeros(len(currents.end_ns))
+    nudged = int(np.searchsorted(currents.end_ns, currents.from_ns + round(NUDGE_S * 1e9)))
     for n, end_ns in enumerate(currents.end_ns):
         advance(params, state, int(end_ns))
-        if n == NUDGED_FRAME:
+        if n == nudged:
             state.x[CHAMBER] += nudge_kpa
             state.x[TUBE] += nudge_kpa
         angle[n], pressure[n] = state.x[ANGLE], state.x[CHAMBER]
@@ -124,25 +136,65 @@ def errors(found: tuple[np.ndarray, np.ndarray], truth: tuple[np.ndarray, np.nda
     return float(np.abs(found[0] - truth[0]).max()), float(np.abs(found[1] - truth[1]).max())
 
 
-def main() -> None:
-    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else SECONDS
-    currents = track("ideal", seconds)
+Errors = list[tuple[float, float, float]]  # step (us), angle (deg), pressure (kPa)
+
+
+def ideal_errors(currents: Currents) -> Errors:
+    """Each step against scipy."""
     truth = oracle_run(currents)
-    print(f"{seconds:g} s; angle {truth[0].min():.1f} to {truth[0].max():.1f} deg")
-    print(f"ideal layer against scipy; wanted: under {IDEAL_LIMITS[0]:g} deg, {IDEAL_LIMITS[1]:g} kPa")
-    for step_us in STEPS_US:
-        angle, pressure = errors(replay("ideal", currents, round(1e3 * step_us)), truth)
-        print(f"  step {step_us:6.0f} us   {angle:9.2e} deg   {pressure:9.2e} kPa")
-    print(f"rig layer against a twentieth of the step; wanted: under {RIG_LIMITS[0]:g} deg, {RIG_LIMITS[1]:g} kPa")
-    for seed in (1, 2, 3):
-        currents = track("rig", seconds, seed)
-        nudged = replay("rig", currents, 500_000, seed, NUDGE_KPA), replay("rig", currents, 500_000, seed)
-        growth = errors(*nudged)[1] / NUDGE_KPA
-        for step_us in STEPS_US:
-            step_ns = round(1e3 * step_us)
-            truth = replay("rig", currents, step_ns // 20, seed)
-            angle, pressure = errors(replay("rig", currents, step_ns, seed), truth)
-            print(f"  seed {seed}  step {step_us:6.0f} us   {angle:9.2e} deg   {pressure:9.2e} kPa   errors grow x{growth:.0f}")
+    return [(us, *errors(replay(currents, round(1e3 * us)), truth)) for us in STEPS_US]
+
+
+def rig_errors(currents: Currents) -> Errors:
+    """Each step against a twentieth of itself."""
+    ns = [round(1e3 * us) for us in STEPS_US]
+    return [(n / 1e3, *errors(replay(currents, n), replay(currents, n // 20))) for n in ns]
+
+
+def growth(currents: Currents) -> float:
+    """The largest error of the pressure that a unit of it at `NUDGE_S` leads to."""
+    return errors(replay(currents, 500_000, NUDGE_KPA), replay(currents, 500_000))[1] / NUDGE_KPA
+
+
+def judge(run: Path, seconds: float, table: Table) -> None:
+    """Add a run's rows."""
+    currents = of_log(open_log(find_log(run)), seconds)
+    ideal = currents.plant.layer == "ideal"
+    name, limits = ("ideal", IDEAL_LIMITS) if ideal else (f"rig, seed {currents.plant.seed}", RIG_LIMITS)
+    grown = growth(currents)
+    for step_us, angle, pressure in ideal_errors(currents) if ideal else rig_errors(currents):
+        kept = "yes" if angle < limits[0] and pressure < limits[1] else "no"
+        table.add_row(name, f"{step_us:g}", f"{angle:.1e}", f"{pressure:.1e}", kept, f"x{grown:.1f}", str(len(currents.end_ns)))
+    table.add_section()
+
+
+def measure(runs: list[Path], seconds: float, progress: Progress) -> Table:
+    """The table of all runs; without one, four are made first."""
+    limits = f"ideal {IDEAL_LIMITS[0]:g} deg, {IDEAL_LIMITS[1]:g} kPa; rig {RIG_LIMITS[0]:g} deg, {RIG_LIMITS[1]:g} kPa"
+    table = Table(title=f"T2, {seconds:g} s; limits: {limits}", title_justify="left")
+    for head in ("layer", "step us", "|dy| deg", "|dP| kPa", "kept", "errors grow", "frames"):
+        table.add_column(head, justify="left" if head == "layer" else "right")
+    with tempfile.TemporaryDirectory(prefix="sl-accuracy-") as folder:
+        if not runs:
+            made = progress.track(RUNS, description="running T2 at wall pace")
+            runs = [make_run(Path(folder), layer, seed) for layer, seed in made]
+        for run in progress.track(runs, description="replaying"):
+            judge(run, seconds, table)
+    return table
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("runs", metavar="RUN", nargs="*", type=Path)
+    parser.add_argument("--seconds", type=float, default=SECONDS)
+    options = parser.parse_args()
+    try:
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            table = measure(options.runs, options.seconds, progress)
+    except SoftloopError as error:
+        sys.stderr.write(f"accuracy: {error}\n")
+        sys.exit(error.exit_code)
+    Console(width=100).print(table)
 
 
 if __name__ == "__main__":

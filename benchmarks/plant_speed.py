@@ -1,4 +1,4 @@
-"""How fast is the simulated rig? CPU time of `run_until` under a crude controller's currents, best of several runs.
+"""How fast is the simulated rig? CPU time of `run_until` under the currents of T2, best of several runs.
 
 python benchmarks/plant_speed.py
 """
@@ -9,7 +9,7 @@ import time
 from typing import Any
 
 import numpy as np
-from crude_tracking import Currents, track
+from logged_currents import Currents, of_closed_loop
 from numba import types
 
 from softloop.devices.protocols.quantise_kernels import current_to_counts
@@ -47,8 +47,8 @@ def measure(layer: str, step_us: int, currents: Currents) -> tuple[float, float,
 
 def main() -> None:
     for layer in ("ideal", "rig"):
-        currents = track(layer, SECONDS)
-        for step_us in (1000, 500, 250):
+        currents = of_closed_loop(layer).until(SECONDS)
+        for step_us in (1000, 500, 250, 100):
             step_ns, steps, times = measure(layer, step_us, currents)
             print(f"{layer:5s}  step {step_us:4d} us  {step_ns:5.0f} ns per step  {steps:6.0f} steps/s  {times:6.0f} x real time")
 

@@ -73,9 +73,9 @@ def _spool_slopes(
     """Eq. 13 in terms of the orifice area it opens, so that its rest is Eq. 16; against a stop the spool stands."""
     area, speed = state.stage[place], state.stage[place + 1]
     pull = drive_m2 - shape.k_v3_m2_pa * upstream_pa + shape.k_v5_m2_pa * downstream_pa
-    spring = area * (1.0 - shape.k_v2_pa * upstream_pa + shape.k_v4_pa * downstream_pa)
-    push = air.spool_rad_s * (air.spool_rad_s * (pull - spring) - 2.0 * air.spool_damping * speed)
-    state.push[(place - AREA_IN) // 2] = push
+    spring = 1.0 - shape.k_v2_pa * upstream_pa + shape.k_v4_pa * downstream_pa
+    push = air.spool_rad_s * (air.spool_rad_s * (pull - spring * area) - 2.0 * air.spool_damping * speed)
+    state.push[(place - AREA_IN) // 2] = air.spool_rad_s**2 * (pull - spring * state.x[place])
     # Only what stood against a stop when the step began is held there: one that arrives goes on, and the step is divided.
     at_seat = state.x[place] <= 0.0 and area <= 0.0 and push <= 0.0
     at_end = state.x[place] >= shape.area_max_m2 and area >= shape.area_max_m2 and push >= 0.0

@@ -95,6 +95,7 @@ def _try(params: Any, state: Any, step_s: float, half_decay: float) -> None:
     slopes(params, state, middle_in, middle_out)
     _next_stage(params, state, step_s / 3.0, 0.5 * step_s)
     slopes(params, state, middle_in, middle_out)
+    state.push_middle[0], state.push_middle[1] = state.push[0], state.push[1]
     _next_stage(params, state, step_s / 3.0, step_s)
     end_in = play(charge + charge_off * decay, state.play_charge_ma, width_in)
     end_out = play(exhaust + exhaust_off * decay, state.play_exhaust_ma, width_out)
@@ -171,14 +172,15 @@ def block_kpa(params: Any, state: Any) -> float:
 
 @kernel(_F8(_F8, _F8, _F8, _F8, _F8))
 def slip_s(coil_ma: float, command_ma: float, held_ma: float, half_width_ma: float, lag_s: float) -> float:
-    """When from now on the coil's transient begins to move the play; inf when it does not, or does so already."""
+    """When from now on the coil's transient begins to move the play; inf when it does not, or already does."""
     off, edge = coil_ma - command_ma, held_ma - half_width_ma
     if off < 0.0:
         edge = held_ma + half_width_ma
     if lag_s <= 0.0 or half_width_ma <= 0.0 or off == 0.0:
         return inf
     share = (edge - command_ma) / off
-    return -lag_s * log(share) if 0.0 < share < 1.0 else inf
+    at_s = -lag_s * log(share) if 0.0 < share < 1.0 else inf
+    return at_s if at_s > _SHORTEST_S else inf
 
 
 @kernel(types.void(PLANT_TYPE, STATE_TYPE, _F8))
@@ -211,7 +213,7 @@ def advance(params: Any, state: Any, to_ns: int) -> None:
         slip_in = slip_s(state.coil_charge_ma, state.command_charge_ma, state.play_charge_ma, width_in, air.coil_lag_s)
         slip_out = slip_s(state.coil_exhaust_ma, state.command_exhaust_ma, state.play_exhaust_ma, width_out, air.coil_lag_s)
         piece_s = min(slip_in, slip_out)
-        if piece_s < left_s - _SHORTEST_S and piece_s > _SHORTEST_S:
+        if piece_s < left_s - _SHORTEST_S:
             _advance_smooth(params, state, piece_s)
             left_s -= piece_s
     _advance_smooth(params, state, left_s)

@@ -184,8 +184,9 @@ STATE = record_dtype(
         ("stage", "f8", (N_STATES,)),
         ("slope", "f8", (N_STATES,)),
         ("next", "f8", (N_STATES,)),
-        ("push", "f8", (N_VALVES,)),  # what acts on each spool in the last stage, m2/s2 of its area
+        ("push", "f8", (N_VALVES,)),  # what acts on each spool where the step began, in the last stage, m2/s2 of its area
         ("push_before", "f8", (N_VALVES,)),  # in the step's first stage
+        ("push_middle", "f8", (N_VALVES,)),
         ("memory", MEMORY),
         ("command_charge_ma", "f8"),
         ("command_exhaust_ma", "f8"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import Any
 
 from numba import types
@@ -29,13 +30,21 @@ def crossing(start: float, start_slope: float, end: float, end_slope: float) -> 
     return high
 
 
-@kernel(_F8(_F8, _F8))
-def _turn(before: float, after: float) -> float:
-    """Where between 0 and 1 a push that grows straight from `before` to `after` changes its direction; 1: not within."""
+@kernel(_F8(_F8, _F8, _F8))
+def turn(before: float, middle: float, after: float) -> float:
+    """Where between 0 and 1 the parabola through three pushes (at 0, 1/2 and 1) changes sign; 1: not within.
+
+    A spool's push rises and falls with its coil's transient, which bends too much within a step for a straight line.
+    """
     if before * after >= 0.0:
         return 1.0
-    share = before / (before - after)
-    return share if share > _SMALLEST_SHARE else 1.0
+    slope, bend = 4.0 * middle - 3.0 * before - after, 2.0 * (before + after) - 4.0 * middle
+    if before > 0.0:
+        before, slope, bend = -before, -slope, -bend
+    root = sqrt(slope * slope - 4.0 * bend * before)
+    # Of the two forms of the root, the one whose sum does not cancel; where the slope is not positive, the bend is.
+    share = -2.0 * before / (slope + root) if slope > 0.0 else (root - slope) / (2.0 * bend)
+    return min(share, 1.0) if share > _SMALLEST_SHARE else 1.0
 
 
 @kernel(types.Tuple((_F8, _F8))(_F8, STATE_TYPE, _I8, _F8))
@@ -43,9 +52,9 @@ def _stop_of(area_max_m2: float, state: Any, place: int, step_s: float) -> tuple
     """(share of the tried step, stop) at which one spool meets a stop or leaves the one it stands at; share 1: neither."""
     before, after, valve = state.x[place], state.next[place], (place - AREA_IN) // 2
     if before <= 0.0 and state.push_before[valve] < 0.0:
-        return _turn(state.push_before[valve], state.push[valve]), 0.0
+        return turn(state.push_before[valve], state.push_middle[valve], state.push[valve]), 0.0
     if before >= area_max_m2 and state.push_before[valve] > 0.0:
-        return _turn(state.push_before[valve], state.push[valve]), area_max_m2
+        return turn(state.push_before[valve], state.push_middle[valve], state.push[valve]), area_max_m2
     if 0.0 <= after <= area_max_m2 or not 0.0 < before < area_max_m2:
         return 1.0, 0.0
     stop = 0.0 if after < 0.0 else area_max_m2

@@ -4,12 +4,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softloop.dynamics.valve import orifice_area
-from softloop.plant.physics import advance, play, slip_s
+from softloop.plant.physics import advance, play, settle_inputs, slip_s
 from softloop.plant.records import AREA_IN, AREA_OUT, SPEED_IN, SPEED_OUT, SUPPLY, TUBE
-from softloop.plant.spool import crossing
+from softloop.plant.spool import crossing, turn
 from tests.plant.rigs import MS, Rig
 
 UNIT = st.floats(-1.0, 1.0)
+LIMIT_M2 = 5e-12
 
 
 @given(UNIT, UNIT, UNIT, UNIT)
@@ -19,6 +20,37 @@ def test_crossing_finds_the_root_of_the_cubic(start, start_slope, end, end_slope
     s = crossing(start, start_slope, end, end_slope)
     basis = np.array([2 * s**3 - 3 * s**2 + 1, s**3 - 2 * s**2 + s, -2 * s**3 + 3 * s**2, s**3 - s**2])
     assert basis @ (start, start_slope, end, end_slope) == pytest.approx(0.0, abs=1e-6)
+
+
+@given(UNIT, UNIT, UNIT)
+def test_turn_finds_the_root_of_the_parabola(before, middle, after):
+    s = turn(before, middle, after)
+    assert 0.0 < s <= 1.0
+    if before * after >= -1e-6:
+        return
+    at_s = before * (1.0 - s) * (1.0 - 2.0 * s) + 4.0 * middle * s * (1.0 - s) + after * s * (2.0 * s - 1.0)
+    assert s == 1.0 or at_s == pytest.approx(0.0, abs=1e-9)
+
+
+def areas_through_a_change(step_us, start, end):
+    """Areas each 1 ms after currents that both plays have followed change to `end`; shape (5, 2)."""
+    rig, found = Rig(seed=3, step_us=step_us), []
+    rig.hold(*start, 0, 100 * MS)
+    rig.state.command_charge_ma, rig.state.command_exhaust_ma = end
+    settle_inputs(rig.params, rig.state)
+    for _ in range(5):
+        advance(rig.params, rig.state, rig.state.t_ns + MS)
+        found.append((rig.state.x[AREA_IN], rig.state.x[AREA_OUT]))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("exhaust_ma", np.linspace(75.0, 200.0, 12).tolist())
+def test_when_both_plays_slip_and_a_spool_leaves_its_seat_the_areas_stay_as_exact(exhaust_ma):
+    changes = ((85.0, 54.0), (61.0, exhaust_ma)), ((61.0, exhaust_ma), (95.0, 54.0))
+    for start, end in changes:
+        coarse, fine = areas_through_a_change(500, start, end), areas_through_a_change(10, start, end)
+        assert np.abs(coarse - fine).max() < LIMIT_M2
+        assert np.ptp(fine, axis=0).max() > 1e-8
 
 
 def test_a_spool_comes_to_rest_where_equation_16_says():
