@@ -40,7 +40,7 @@ from softloop.plant.setup import new_device, new_state, plant_record
 from softloop.wire.errors import SoftloopError
 
 SECONDS = 60.0
-STEPS_US = (1000.0, 500.0, 250.0, 100.0)
+STEPS_US = (1000.0, 500.0, 400.0, 250.0, 100.0)
 NUDGE_S, NUDGE_KPA = 0.5, 1e-5
 RUNS = (("ideal", 1), ("rig", 1), ("rig", 2), ("rig", 3))
 IDEAL_LIMITS = (1e-3, 1e-2)  # deg, kPa

@@ -75,7 +75,7 @@ class PlantConfig(Table):
     layer: Literal["ideal", "rig"] = Field("rig", description="ideal: the controller's own model; rig: also what that leaves out")
     seed: int = Field(1, ge=0, description="which specimen of a rig, and its noise")
     parameters: str = Field("table1", description="parameter file about which the rig is drawn: a path, or a shipped name")
-    step_us: int = Field(250, ge=10, le=1000, description="longest integration step; pieces between events are shorter")
+    step_us: int = Field(400, ge=10, le=1000, description="longest integration step; pieces between events are shorter")
 
     can_valves: str = Field("can0", description="which [can.NAME] the simulated valve driver is on")
     can_analog: str = Field("can0", description="which [can.NAME] the simulated analogue module is on")
