@@ -30,11 +30,9 @@ from softloop.offline.evaluation import (
     evaluate,
     figures,
     tuned,
-    tuned_file,
 )
 from softloop.offline.tuning import BARS_DEG, SWITCHES_PER_S
 from softloop.plant.config import PlantConfig
-from softloop.wire.benchfile import read_toml
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
 
 _COLUMNS = {
@@ -114,7 +112,8 @@ def show(verdicts: Sequence[Verdict], latency: dict[str, float], confirmed: list
         for head in (*_COLUMNS, "bars", "payload", "paper"):
             table.add_column(head, justify="right")
         for verdict in (v for v in verdicts if v.condition == condition):
-            table.add_row(f"{verdict.law}, tuned at +{verdict.tuned_at_ms:g} ms", *_row(verdict))
+            at = "not tuned" if verdict.tuned_at_ms is None else f"tuned at +{verdict.tuned_at_ms:g} ms"
+            table.add_row(f"{verdict.law}, {at}", *_row(verdict))
         console.print(table)
     paper = ", ".join(f"{name} {bound:g}" for name, bound in PAPER_DEG.items())
     bars = ", ".join(f"{name} {bar:g}" for name, bar in BARS_DEG.items())
@@ -153,7 +152,7 @@ def confirm_runs(laws: Sequence[str], seeds: Sequence[int]) -> list[dict[str, An
 def _run_at_wall_pace(law: str, seed: int, trajectory: str) -> dict[str, Any]:
     content = tomlkit.parse(find_bench(Path("sim")).read_text())
     content["plant"]["seed"] = seed
-    content["controller"] = {**read_toml(tuned_file(law))["controller"], "trajectory": trajectory}
+    content["controller"] = {**tuned(law)[0].model_dump(), "trajectory": trajectory}
     with tempfile.TemporaryDirectory(prefix="softloop-") as folder:
         bench, run_dir = Path(folder) / "bench.toml", Path(folder) / "run"
         bench.write_text(tomlkit.dumps(content))

@@ -32,7 +32,7 @@ def perturbed(seed: int, folder: Path) -> Path:
     """A parameter file whose mechanics and leak lie anywhere inside Table 1's bounds."""
     content = tomlkit.parse(shipped().read_text())
     rng = np.random.RandomState(seed)
-    entries = [*content["bending"].values(), content["pneumatics"]["leak_m2"]]  # type: ignore[union-attr, index]
+    entries = [*content["bending"].values(), content["pneumatics"]["leak_m2"]]
     for entry in entries:
         entry["value"] = float(entry["min"] + rng.uniform() * (entry["max"] - entry["min"]))
     path = folder / f"rig{seed}.toml"
