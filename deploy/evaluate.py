@@ -30,11 +30,9 @@ from softloop.offline.evaluation import (
     evaluate,
     figures,
     tuned,
-    tuned_file,
 )
 from softloop.offline.tuning import BARS_DEG, SWITCHES_PER_S
 from softloop.plant.config import PlantConfig
-from softloop.wire.benchfile import read_toml
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
 
 _COLUMNS = {
@@ -44,10 +42,12 @@ _COLUMNS = {
     "payload": "payload_peak_deg",
     "back, s": "payload_recovery_s",
     "leaves": "left_peak_deg",
-    "sw/s dwell": "dwell_switches_per_s",
-    "sw/s T2": "t2_switches_per_s",
-    "effort T2": "t2_effort_ma_s",
+    "switches": "dwell_switches_per_s",
+    "on T2": "t2_switches_per_s",
+    "effort": "t2_effort_ma_s",
 }
+_WIDTH = 190  # wider than most terminals, so that a page can show it whole
+_KEPT = {"bars": "bars_kept", "load": "payload_kept", "quiet": "quiet", "paper": "paper_kept"}
 _SHARE_OF_RIGS = 0.9  # of the rigs on which the bars must hold: 18 of 20
 
 
@@ -104,17 +104,18 @@ def latency_budget(law: str, seed: int) -> dict[str, float]:
 
 def show(verdicts: Sequence[Verdict], latency: dict[str, float], confirmed: list[dict[str, Any]]) -> None:
     """One table per condition: the worst rig's figure, and the median's."""
-    console = Console(width=190)
+    console = Console(width=_WIDTH)
     hops = ", ".join(f"{name.removesuffix('_ms').replace('_', ' ')} {value:.2f} ms" for name, value in latency.items())
     console.print(f"latency budget: {hops}")
     for condition in dict.fromkeys(v.condition for v in verdicts):
-        title = f"{condition}: worst (median) of the rigs; deg, deg, deg, deg, s, deg, 1/s, 1/s, mA/s"
+        title = f"{condition}: worst (median) of the rigs; deg, s, 1/s, mA/s"
         table = Table(title=title, title_justify="left")
-        table.add_column("law")
-        for head in (*_COLUMNS, "bars", "payload", "paper"):
+        table.add_column("law, tuned at ms", no_wrap=True)
+        for head in (*_COLUMNS, *_KEPT):
             table.add_column(head, justify="right")
         for verdict in (v for v in verdicts if v.condition == condition):
-            table.add_row(f"{verdict.law}, tuned at +{verdict.tuned_at_ms:g} ms", *_row(verdict))
+            at = "defaults" if verdict.tuned_at_ms is None else f"at +{verdict.tuned_at_ms:g}"
+            table.add_row(f"{verdict.law} {at}", *_row(verdict))
         console.print(table)
     paper = ", ".join(f"{name} {bound:g}" for name, bound in PAPER_DEG.items())
     bars = ", ".join(f"{name} {bar:g}" for name, bar in BARS_DEG.items())
@@ -126,8 +127,8 @@ def show(verdicts: Sequence[Verdict], latency: dict[str, float], confirmed: list
 
 def _row(verdict: Verdict) -> list[str]:
     found = figures(verdict.judged)
-    cells = [f"{found[name]['worst']:.2f} ({found[name]['median']:.2f})" for name in _COLUMNS.values()]
-    return cells + [f"{found[name]}/{found['rigs']}" for name in ("bars_kept", "payload_kept", "paper_kept")]
+    cells = [f"{found[name]['worst']:.3g} ({found[name]['median']:.3g})" for name in _COLUMNS.values()]
+    return cells + [f"{found[name]}/{found['rigs']}" for name in _KEPT.values()]
 
 
 def draw(laws: Sequence[str], seed: int, folder: Path) -> None:
@@ -153,7 +154,7 @@ def confirm_runs(laws: Sequence[str], seeds: Sequence[int]) -> list[dict[str, An
 def _run_at_wall_pace(law: str, seed: int, trajectory: str) -> dict[str, Any]:
     content = tomlkit.parse(find_bench(Path("sim")).read_text())
     content["plant"]["seed"] = seed
-    content["controller"] = {**read_toml(tuned_file(law))["controller"], "trajectory": trajectory}
+    content["controller"] = {**tuned(law)[0].model_dump(), "trajectory": trajectory}
     with tempfile.TemporaryDirectory(prefix="softloop-") as folder:
         bench, run_dir = Path(folder) / "bench.toml", Path(folder) / "run"
         bench.write_text(tomlkit.dumps(content))

@@ -17,10 +17,9 @@ import numpy as np
 from softloop.controller.config import ControllerConfig
 from softloop.controller.setup import build
 from softloop.offline.trials import Trial, lead_s, run_trial
-from softloop.offline.tuning import BARS_DEG, SWITCHES_PER_S, Latency
+from softloop.offline.tuning import BARS_DEG, SWITCHES_PER_S, Latency, start_config
 from softloop.plant.config import FaultConfig, PlantConfig
 from softloop.wire.benchfile import load_model, read_toml
-from softloop.wire.errors import BadFile
 
 Progress = Callable[[int, int], None]  # rigs done, rigs in all
 
@@ -69,8 +68,8 @@ def tuned_file(law: str, added_ms: float = 0.0) -> Path:
     return Path(str(resources.files("softloop.controller") / "data" / "tuned" / f"{law}{suffix}.toml"))
 
 
-def tuned(law: str, added_ms: float = 0.0) -> tuple[ControllerConfig, float]:
-    """The tuned [controller] of a law, and the added latency that it was tuned at.
+def tuned(law: str, added_ms: float = 0.0) -> tuple[ControllerConfig, float | None]:
+    """The tuned [controller] of a law, and the added latency that it was tuned at; None: not tuned, the gains are defaults.
 
     Where a latency has no gains of its own, those of the rig's own latency, told of the added delay. Raises BadFile or BadConfig.
     """
@@ -78,7 +77,7 @@ def tuned(law: str, added_ms: float = 0.0) -> tuple[ControllerConfig, float]:
     if not path.is_file():
         path, at_ms = tuned_file(law), 0.0
     if not path.is_file():
-        raise BadFile(f"{law} has no tuned gains; make them with: softloop tune {law} --out FILE")
+        return Latency(added_ms).controller(start_config(law)), None
     found = load_model(ControllerConfig, read_toml(path)["controller"], path)
     return Latency(added_ms - at_ms).controller(found), at_ms
 
@@ -161,7 +160,7 @@ class Verdict:
 
     law: str
     condition: str
-    tuned_at_ms: float
+    tuned_at_ms: float | None
     judged: list[Judged]
 
     def content(self) -> dict[str, Any]:

@@ -48,7 +48,7 @@ class Trial:
 
 
 # From the plant's start to the first tick, about: when a load did come and go is then found by the truth's own flag.
-_SETTLE_S = 0.2
+_SETTLE_S = 0.5
 
 
 def lead_s(controller: ControllerConfig) -> float:
@@ -66,7 +66,9 @@ def run_trial(controller: ControllerConfig, plant: PlantConfig, *, payload: bool
 
 
 def judge(run: Run) -> Trial:
-    """The figures of a run; loads are found in the truth."""
+    """The figures of a run; loads are found in the truth. One that the gate broke off counts as lost in every figure."""
+    if not run.completed:
+        return Trial(**dict.fromkeys(Trial.__dataclass_fields__, _LOST_DEG))
     on = run.cycles["trajectory_ns"] >= 0
     cycles, truths = run.cycles[on], run.truths[on]
     error = np.abs(truths["angle_deg"] - cycles["reference_deg"])
