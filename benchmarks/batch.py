@@ -1,4 +1,4 @@
-"""How fast is the closed loop in one process? Times real time per core (CPU time, best of several runs), by law, on the rig layer.
+"""How fast is the closed loop in one process? Times real time per core (CPU time, best of several runs) on the rig layer.
 
 With it where the time goes, scipy's `solve_ivp` closing the same loop for a ratio, two processes against one (and two threads),
 and a cold start. The machine's load is printed, as it spoils all of these.
@@ -24,6 +24,7 @@ from crude_tracking import Currents
 from plant_speed import loop as run_plant_alone
 from scipy_loop import scipy_loop
 
+from softloop.controller.records import LAWS as ALL_LAWS
 from softloop.deploy.batch import rig_tables
 from softloop.deploy.bench import find_bench, load_bench
 from softloop.offline.campaign import Case, Group, controller_for, plan_cases, run_cases
@@ -34,7 +35,8 @@ from softloop.plant.records import EVENT
 from softloop.plant.setup import new_device, new_state, plant_record
 from softloop.wire.schedule import PERIOD_NS, START_NS, make_schedule
 
-LAWS, TRAJECTORIES, REPEATS = ("pid", "arc"), ("t1", "t2"), 7
+TRAJECTORIES, REPEATS = ("t1", "t2"), 7
+LAWS = tuple(law for law in ALL_LAWS if law != "pressure")  # a campaign judges angles
 SCIPY_S, SCIPY_METHODS = 2.0, ("RK45", "LSODA")
 JOBS_SEEDS = 60
 PERIOD_S = 1e-9 * PERIOD_NS
@@ -70,7 +72,7 @@ def show_speed(tables: RigTables) -> None:
             whole, scores = best_cpu_s(lambda own=own: simulate_tables(own)), best_cpu_s(lambda run=run: run_scores(run))
             alone, steps_s = plant_alone(own, seconds)
             print(
-                f"  {law:4s} {trajectory}  {seconds / whole:6.0f} x   with scores {seconds / (whole + scores):6.0f} x   "
+                f"  {law:7s} {trajectory}  {seconds / whole:6.0f} x   with scores {seconds / (whole + scores):6.0f} x   "
                 f"plant alone {seconds / alone:6.0f} x ({100.0 * alone / whole:.0f} % of the time, {steps_s:.0f} steps/s)"
             )
 
@@ -103,7 +105,7 @@ def show_scipy(tables: RigTables) -> None:
             theirs = time.process_time() - begin
             apart = np.abs(theirs_deg[: len(angle)] - angle[: len(theirs_deg)]).max()
             speed, ratio = SCIPY_S / theirs, theirs / ours
-            print(f"  {law:4s} {method:6s} {speed:6.2f} x real time; this loop: {ratio:4.0f} times it; {apart:.1e} deg apart")
+            print(f"  {law:7s} {method:6s} {speed:6.2f} x real time; this loop: {ratio:4.0f} times it; {apart:.1e} deg apart")
 
 
 def show_jobs(tables: RigTables) -> None:
