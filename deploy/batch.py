@@ -33,7 +33,7 @@ from softloop.offline.campaign import (
     result_dict,
     verdicts,
 )
-from softloop.offline.closed_loop import RigTables
+from softloop.offline.closed_loop import RigTables, ready_controller
 from softloop.offline.pools import run_here, run_in_processes, run_on_dask
 from softloop.wire.errors import EXIT_OK, BadConfig, Unavailable
 from softloop.wire.mcap_layout import git_state, versions
@@ -74,9 +74,9 @@ def batch(bench_file: Path, wanted: Wanted) -> int:
     laws, trajectories = wanted.laws or (tables.controller.law,), wanted.trajectories or (tables.controller.trajectory,)
     check_laws(laws)
     cases = plan_cases(laws, trajectories, seeds, payload=wanted.payload)
-    folder = _make_folder(bench, wanted.out)
     for case in {c.group: c for c in cases}.values():
-        case_tables(tables, case)  # what is wrong with a law or a trajectory is said before a worker begins
+        ready_controller(case_tables(tables, case)[0].controller)  # what is wrong with it is said before a worker begins
+    folder = _make_folder(bench, wanted.out)
     results = _in_order(cases, _work(tables, cases, wanted))
     found = verdicts(results)
     report = _report(bench, found, results)

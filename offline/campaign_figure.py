@@ -51,13 +51,8 @@ def _curve(axis: Axes, group: Group, errors: Any, color: str) -> None:
     """The empirical distribution; a run that was lost lies beyond every value, so the curve then ends under 1."""
     shares = np.arange(1, len(errors) + 1) / len(errors)
     finite = np.isfinite(errors)
-    label = f"{group.law}, payload" if group.payload else group.law
     at, height = errors[finite], shares[finite]
-    axis.step(
-        np.append(at[:1], at),
-        np.append([0.0][: len(at)], height),
-        where="post",
-        color=color,
-        linestyle="--" if group.payload else "-",
-        label=label,
-    )
+    if at.size:  # rises from zero
+        at, height = np.append(at[0], at), np.append(0.0, height)
+    label = f"{group.law}, payload" if group.payload else group.law
+    axis.step(at, height, where="post", color=color, linestyle="--" if group.payload else "-", label=label)

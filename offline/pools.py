@@ -90,7 +90,7 @@ def run_on_dask(tables: RigTables, cases: Sequence[Case], scheduler: str) -> Ite
         check_workers(client)
         [shared] = client.scatter([tables], broadcast=True)
         futures = [client.submit(run_cases, shared, chunk, pure=False) for chunk in chunks(cases)]
-        for future in as_completed(futures):
+        for future in as_completed(futures, loop=client.loop):
             yield from future.result()
             future.release()
     finally:

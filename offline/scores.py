@@ -55,8 +55,7 @@ def run_scores(run: Run, changes_ns: Sequence[int] = ()) -> Scores:
         run: its records.
         changes_ns: rig clock at which loads come and leave, ascending; those outside PHASE_TRACK do not count.
     """
-    track = run.cycles["phase"] == metrics.PHASE_TRACK
-    cycles, truths = run.cycles[track], run.truths[track]
+    cycles, truths = _tracked(run)
     error_deg = truths["angle_deg"] - cycles["reference_deg"]
     if run.fault or not run.completed or not len(cycles) or not np.isfinite(error_deg).all():
         return lost(with_loads=bool(changes_ns))
@@ -70,6 +69,16 @@ def run_scores(run: Run, changes_ns: Sequence[int] = ()) -> Scores:
         peak_deg=peak,
         recovery_s=recovery,
     )
+
+
+def _tracked(run: Run) -> tuple[NDArray[Any], NDArray[Any]]:
+    """The records of PHASE_TRACK; not copied where they are one stretch, as that costs more than the scores do."""
+    track = run.cycles["phase"] == metrics.PHASE_TRACK
+    stretches = metrics.runs_of(track)
+    if len(stretches) == 1:
+        part = slice(*stretches[0])
+        return run.cycles[part], run.truths[part]
+    return run.cycles[track], run.truths[track]
 
 
 def lost(*, with_loads: bool = False) -> Scores:

@@ -45,7 +45,7 @@ def test_the_first_sample_of_track_counts(log):
 def test_errors_of_a_known_sine():
     t = np.arange(400) * 0.005
     cycles = records("CycleRecord", 400, stamp_ns=(t * 1e9).astype(np.int64), phase=2, reference_rate_deg_s=1.0)
-    errors = metrics._errors(cycles["stamp_ns"], 3.0 * np.sin(2 * np.pi * t), cycles)
+    errors = metrics.errors_at(cycles["stamp_ns"], 3.0 * np.sin(2 * np.pi * t), cycles)
     figures = errors.figures()
     assert figures["max_deg"] == pytest.approx(3.0, abs=1e-3)
     assert figures["rms_deg"] == pytest.approx(3.0 / np.sqrt(2.0), rel=1e-6)
@@ -67,7 +67,7 @@ def test_the_steady_error_is_the_worst_of_the_last_two_seconds_only():
     error = np.zeros(n)
     error[n - 402] = 9.0  # just before the last 2 s
     error[n - 401] = -0.7  # their first sample
-    assert metrics._errors(cycles["stamp_ns"], error, cycles).figures()["steady_deg"] == pytest.approx(0.7)
+    assert metrics.errors_at(cycles["stamp_ns"], error, cycles).figures()["steady_deg"] == pytest.approx(0.7)
 
 
 def test_a_reference_without_an_angle_has_no_angle_error(log):
