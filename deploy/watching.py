@@ -19,6 +19,7 @@ from softloop.watch.echo import choose, writer
 from softloop.watch.guest import guest_wire
 from softloop.watch.overview import Overview
 from softloop.watch.top import CpuMeter, screen
+from softloop.wire.backlog import Backlog
 from softloop.wire.errors import EXIT_LOST, EXIT_OK
 from softloop.wire.messages import BadPayload, constant
 from softloop.wire.session import Inbox
@@ -52,21 +53,21 @@ def top(bench_file: Path, seconds: float | None, *, once: bool) -> int:
     return EXIT_OK
 
 
-def _one_look(inbox: Inbox, overview: Overview, cpu: CpuMeter, stop: Stop, seconds: float) -> None:
+def _one_look(inbox: Backlog, overview: Overview, cpu: CpuMeter, stop: Stop, seconds: float) -> None:
     end = time.monotonic() + seconds
     while time.monotonic() < end and not stop.wait(LOOK_S):
-        overview.take(inbox.take_all())
+        overview.take(inbox.take_all()[0])
         for status, _ in overview.statuses.values():
             cpu.percent(status.pid)
     console = Console(width=WIDTH) if not sys.stdout.isatty() else Console()
     console.print(screen(overview, cpu, time.monotonic()))
 
 
-def _keep_looking(inbox: Inbox, overview: Overview, cpu: CpuMeter, stop: Stop, seconds: float | None) -> None:
+def _keep_looking(inbox: Backlog, overview: Overview, cpu: CpuMeter, stop: Stop, seconds: float | None) -> None:
     end = time.monotonic() + (seconds or 1e9)
     with Live(console=Console(), auto_refresh=False, screen=True) as live:
         while time.monotonic() < end and not stop.wait(LOOK_S):
-            overview.take(inbox.take_all())
+            overview.take(inbox.take_all()[0])
             live.update(screen(overview, cpu, time.monotonic()), refresh=True)
 
 

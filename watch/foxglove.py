@@ -14,7 +14,7 @@ from softloop.wire.channels import CHANNELS, Channel, channel_of_key, key
 from softloop.wire.errors import Unavailable
 from softloop.wire.mcap_layout import MESSAGE_ENCODING, SCHEMA_ENCODING, Origin, topic_of_key
 from softloop.wire.messages import BadPayload, message
-from softloop.wire.session import Inbox, Wire
+from softloop.wire.session import Wire
 from softloop.wire.shell import Stop
 
 HOST = "127.0.0.1"
@@ -109,10 +109,10 @@ def _one_line(error: Exception) -> str:
 
 def serve(bridge: Bridge, wire: Wire, stop: Stop, on_ready: Callable[[str], None]) -> None:
     """Hand on what comes by, until `stop`."""
-    inbox: Inbox = wire.everything(CAPACITY)
+    inbox = wire.everything(CAPACITY)
     on_ready(bridge.address)
     while not stop:
-        for item in inbox.take_all():
+        for item in inbox.take_all()[0]:
             bridge.put(*item)
         time.sleep(POLL_S)
     bridge.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from softloop.offline.figures import _STYLE, BLACK, BLUE, RED, _figure, _legend
+from softloop.offline.figures import BLACK, BLUE, RED, STYLE, _legend, make_figure
 from softloop.offline.identification.output_error import Fit, free_run
 from softloop.offline.identification.series import Series, nrmse_fit
 
@@ -14,8 +14,8 @@ PANEL_IN = 2.2
 
 def validation(fit: Fit, runs: list[Series]) -> Figure:
     """One panel for each run: angle as measured and as simulated, and ten times their difference."""
-    with mpl.rc_context(_STYLE):
-        figure, axes = _figure(PANEL_IN * len(runs), len(runs))
+    with mpl.rc_context(STYLE):
+        figure, axes = make_figure(PANEL_IN * len(runs), len(runs))
         for axis, run in zip(axes, runs, strict=True):
             counted, simulated = run.counted, free_run(fit, run)
             time_s, angle = run.time_s[counted], run.angle_deg[counted]

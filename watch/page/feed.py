@@ -9,12 +9,13 @@ from typing import Any
 from softloop.watch.overview import Overview
 from softloop.watch.page.history import History
 from softloop.watch.page.state import EventLine, as_json, events_of, state_of
+from softloop.wire.backlog import Backlog
 from softloop.wire.channels import CAN, CYCLE, EVENT, PRESSURE, ROOT, STATUS, VALVES, key
-from softloop.wire.session import Inbox, Wire
+from softloop.wire.session import Wire
 
 FRAME_S = 1.0 / 30.0
 STATE_EVERY = 3  # frames
-CAPACITY = 4096  # of each inbox: 20 s of a fast channel
+CAPACITY = 4096  # of each channel: 20 s of a fast one
 TICKS_PER_S = 200
 SILENT_S = 2.0
 CHANNELS = (CYCLE, VALVES, PRESSURE, EVENT, STATUS)
@@ -38,14 +39,14 @@ class Feed:
         self.events_seen = 0
         self.more: dict[str, Any] = {}  # what else the state is to hold
         self._event_line = event_line
-        self._inboxes: list[Inbox] = []
+        self._inboxes: list[Backlog] = []
         self._renewed_s = 0.0
         self._waiting = asyncio.Event()
 
     def connect(self, wire: Wire) -> None:
         """Listen to a bench. From any thread, once."""
         keys = [key(wire.bench, channel) for channel in CHANNELS] + [f"{ROOT}/{wire.bench}/{CAN.name}/**"]
-        self._inboxes = [Inbox(wire.session, one, CAPACITY) for one in keys]
+        self._inboxes = [Backlog(wire.session, one, CAPACITY) for one in keys]
 
     def gate(self) -> tuple[int | None, float]:
         """The gate's state, and when it was heard, s."""
@@ -65,7 +66,7 @@ class Feed:
     def turn(self, now_s: float) -> None:
         """One frame: take what came, and now and then say anew how things are."""
         self.frame += 1
-        self.overview.take([item for inbox in self._inboxes for item in inbox.take_all()], now_s)
+        self.overview.take([item for inbox in self._inboxes for item in inbox.take_all()[0]], now_s)
         self.history.append(self.overview.cycles)
         if self.frame % STATE_EVERY == 0:
             self.state = as_json(state_of(self.overview, now_s) | {"start_ns": self.history.start_ns} | self.more)
