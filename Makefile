@@ -18,6 +18,7 @@ help:
 	@echo 'make test   set up, then all tests'
 	@echo 'make exact  set up, then the three exactness contracts for every law, with both cores kept busy'
 	@echo 'make test-page  the live page in a real browser (Debian: apt install chromium)'
+	@echo 'make docs   the documentation as pages, in docs/_build/html'
 	@echo 'make lint   ruff, mypy and the rules of who may import whom'
 	@echo 'make lock   compute requirements.lock again from pyproject.toml'
 	@echo 'make clean  remove the environment, caches and built files; runs/ stays'
@@ -54,6 +55,11 @@ exact: $(STAMP)
 	$(BIN)/softloop warm
 	$(BIN)/python -m pytest -m exact
 
+# Warnings are errors.
+docs: $(STAMP)
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo 'docs/_build/html/index.html'
+
 lint: $(STAMP)
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/ruff format --check $(SOURCES)
@@ -66,5 +72,5 @@ lock: $(STAMP)
 		--extra dev --extra docs --extra foxglove --output-file requirements.lock pyproject.toml
 
 clean:
-	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis src/*.egg-info
+	rm -rf $(VENV) build dist docs/_build docs/generated .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis src/*.egg-info
 	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +

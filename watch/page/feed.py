@@ -15,7 +15,7 @@ from softloop.wire.session import Wire
 
 FRAME_S = 1.0 / 30.0
 STATE_EVERY = 3  # frames
-CAPACITY = 4096  # of each inbox: 20 s of a fast channel
+CAPACITY = 4096  # of each channel: 20 s of a fast one
 TICKS_PER_S = 200
 SILENT_S = 2.0
 CHANNELS = (CYCLE, VALVES, PRESSURE, EVENT, STATUS)
