@@ -1,5 +1,6 @@
 """The gate over random sequences of events: without a new arm request nothing leads from FAULT to current in the charge valve."""
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -32,6 +33,14 @@ ANYTHING = st.fixed_dictionaries(
     },
 )
 OLD_REQUEST = st.sampled_from([{}, {"arm": 1, "arm_origin": 77, "arm_seq": 1}, {"arm": 1, "arm_origin": 77, "arm_seq": 0}])
+
+
+@pytest.mark.parametrize("sensor", ["pressure", "inclination"])
+def test_a_sample_of_this_very_moment_is_fresh_and_one_of_the_next_is_of_no_clock(sensor):
+    bench = GateBench().armed()
+    assert bench.tick(**{f"{sensor}_stamp_ns": bench.now_ns + PERIOD_NS}).gate == g.GATE_ARMED
+    output = bench.tick(**{f"{sensor}_stamp_ns": bench.now_ns + PERIOD_NS + 1})
+    assert (output.gate, output.reason) == (g.GATE_FAULT, g.REASON_SENSOR_STALE)
 
 
 def is_vented_or_shut(output):
