@@ -64,10 +64,11 @@ def check(bench: BenchArgument) -> int:
     """Check a bench file, and that the actuator can follow its trajectory."""
     from softloop.deploy.bench import find_bench, load_bench
     from softloop.deploy.node import processes_of
-    from softloop.deploy.prepare import check_controller
+    from softloop.deploy.prepare import check_controller, check_identity
 
     loaded = load_bench(find_bench(bench))
     trajectory_s = check_controller(loaded)
+    check_identity(loaded)
     names = ", ".join(p.name for p in processes_of(loaded)) or "no process"
     print(f"{bench}: good. Bench '{loaded.name}': {names}; trajectory {trajectory_s:.1f} s")
     return EXIT_OK
@@ -132,6 +133,7 @@ def identify(
     interval: Annotated[
         Literal["coloured", "bootstrap", "white"], typer.Option(help="What the residuals are taken for.")
     ] = "coloured",
+    output: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Write a parameter file with its evidence.")] = None,
     select: Annotated[bool, typer.Option("--select", help="Compare orders instead.")] = False,
     venting: Annotated[
         bool, typer.Option("--venting", help="Fit the flow law of an emptying volume; map time, pressure and maybe input.")
@@ -147,7 +149,7 @@ def identify(
         return identification.identify_vent(tuple(csv or ()), tuple(columns or ()), train, as_json=as_json)
     asked = identification.Asked(
         tuple(runs or ()), tuple(csv or ()), tuple(columns or ()), orders, hysteresis, creep, delay, lag, at_rest, method,
-        interval, select, figure, as_json,
+        interval, select, output, figure, as_json,
     )  # fmt: skip
     return identification.identify(asked)
 

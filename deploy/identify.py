@@ -10,17 +10,18 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from softloop.deploy.evidence import write_evidence
 from softloop.deploy.progress import counted_progress
 from softloop.dynamics.parameters import load_parameters, shipped
 from softloop.offline.identification.csv_map import parse_map, read_csv, read_vent
 from softloop.offline.identification.experiments import halves
-from softloop.offline.identification.fitting import bare_of, fit_output_error
+from softloop.offline.identification.fitting import fit_output_error
 from softloop.offline.identification.intervals import Uncertainty, of_fit, of_regression
 from softloop.offline.identification.orders import compare
 from softloop.offline.identification.output_error import Fit, score
 from softloop.offline.identification.regression import as_fit, instrumental_variables, least_squares
 from softloop.offline.identification.series import Series, from_log
-from softloop.offline.identification.structure import PAPER, Structure
+from softloop.offline.identification.structure import PAPER, Structure, bare_of
 from softloop.offline.identification.venting import fit_vent, score_vent
 from softloop.offline.log import find_log, open_log
 from softloop.wire.errors import EXIT_OK, BadConfig
@@ -42,6 +43,7 @@ class Asked:
     method: str
     interval: str
     select: bool
+    output: Path | None
     figure: Path | None
     as_json: bool
 
@@ -64,6 +66,8 @@ def identify(asked: Asked) -> int:
         return _select(structure, train, validate, as_json=asked.as_json)
     fit, uncertainty = fitted(structure, train, asked.method, asked.interval)
     answer = Answer(fit, uncertainty, train, {v.name: score(fit, v) for v in validate})
+    if asked.output:
+        write_evidence(asked.output, asked.runs, fit, uncertainty, [train, *validate])
     if asked.figure:
         from softloop.offline.identification.figures import validation  # noqa: PLC0415 - matplotlib only where it draws
 
