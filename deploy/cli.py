@@ -155,6 +155,25 @@ def identify(
 
 
 @app.command()
+def valve(
+    csv: Annotated[Path, typer.Argument(metavar="FILE", help="Steady flow tests of one valve, a row each.")],
+    columns: Annotated[
+        list[str] | None,
+        typer.Option("--map", metavar="KEY=COLUMN", help="current (mA), upstream, downstream (kPa gauge), flow (kg/s)."),
+    ] = None,
+    discharge: Annotated[
+        float, typer.Option(metavar="C_f", min=0.01, max=1.0, help="Discharge coefficient; 1: areas hold it.")
+    ] = 1.0,
+    temperature: Annotated[float, typer.Option(metavar="K", min=200.0, max=400.0, help="Of the gas.")] = 293.15,
+    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
+) -> int:
+    """Identify a valve's model, Eqs. 12 and 16, from flow tests; what they do not show gets no number."""
+    from softloop.deploy.identify import identify_valve
+
+    return identify_valve(csv, tuple(columns or ()), discharge, temperature, as_json=as_json)
+
+
+@app.command()
 def coverage(
     rigs: Annotated[int, typer.Option(min=1, help="How many rigs; on the rig layer each is excited 40 times.")] = 1000,
     layer: Annotated[Literal["ideal", "rig"], typer.Option(help="Rigs that are the model, or that have more than it.")] = "ideal",

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from test_valve_flow import flow_tests
 
 from softloop.deploy import cli
 from softloop.deploy.bench import load_bench
@@ -95,3 +96,15 @@ def test_coverage_counts_and_writes(tmp_path, capsys):
     row = counted["methods"]["oe coloured"]["b0"]
     assert row["low"] <= row["held"] <= row["high"]
     assert 0.0 < row["half_percent"] < 1.0
+
+
+def test_flow_tests_of_one_pressure_are_answered_with_no(tmp_path, capsys):
+    columns = [f"--map={key}={key}" for key in ("current", "upstream", "downstream", "flow")]
+    for supplies, downstreams, code in (((100.0, 150.0, 200.0), (0.0, 50.0, 90.0), 0), ((200.0,), (0.0,), 1)):
+        tests = flow_tests(supplies, downstreams)
+        rows = np.column_stack([tests.current_ma, tests.upstream_kpa, tests.downstream_kpa, tests.flow_kg_s])
+        file = tmp_path / "flow.csv"
+        np.savetxt(file, rows, delimiter=",", header="current,upstream,downstream,flow", comments="")
+        assert softloop("valve", file, *columns, "--discharge", "0.8", "--json") == code
+        answer = json.loads(capsys.readouterr().out)
+        assert bool(answer["numbers"]) == (code == 0)
