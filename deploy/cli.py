@@ -77,10 +77,11 @@ def check(bench: BenchArgument) -> int:
     """Check a bench file, and that the actuator can follow its trajectory."""
     from softloop.deploy.bench import find_bench, load_bench
     from softloop.deploy.node import processes_of
-    from softloop.deploy.prepare import check_controller
+    from softloop.deploy.prepare import check_controller, check_identity
 
     loaded = load_bench(find_bench(bench))
     trajectory_s = check_controller(loaded)
+    check_identity(loaded)
     names = ", ".join(p.name for p in processes_of(loaded)) or "no process"
     print(f"{bench}: good. Bench '{loaded.name}': {names}; trajectory {trajectory_s:.1f} s")
     return EXIT_OK
@@ -229,6 +230,7 @@ def identify(
     interval: Annotated[
         Literal["coloured", "bootstrap", "white"], typer.Option(help="What the residuals are taken for.")
     ] = "coloured",
+    output: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Write a parameter file with its evidence.")] = None,
     select: Annotated[bool, typer.Option("--select", help="Compare orders instead.")] = False,
     venting: Annotated[
         bool, typer.Option("--venting", help="Fit the flow law of an emptying volume; map time, pressure and maybe input.")
@@ -244,9 +246,28 @@ def identify(
         return identification.identify_vent(tuple(csv or ()), tuple(columns or ()), train, as_json=as_json)
     asked = identification.Asked(
         tuple(runs or ()), tuple(csv or ()), tuple(columns or ()), orders, hysteresis, creep, delay, lag, at_rest, method,
-        interval, select, figure, as_json,
+        interval, select, output, figure, as_json,
     )  # fmt: skip
     return identification.identify(asked)
+
+
+@app.command()
+def valve(
+    csv: Annotated[Path, typer.Argument(metavar="FILE", help="Steady flow tests of one valve, a row each.")],
+    columns: Annotated[
+        list[str] | None,
+        typer.Option("--map", metavar="KEY=COLUMN", help="current (mA), upstream, downstream (kPa gauge), flow (kg/s)."),
+    ] = None,
+    discharge: Annotated[
+        float, typer.Option(metavar="C_f", min=0.01, max=1.0, help="Discharge coefficient; 1: areas hold it.")
+    ] = 1.0,
+    temperature: Annotated[float, typer.Option(metavar="K", min=200.0, max=400.0, help="Of the gas.")] = 293.15,
+    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
+) -> int:
+    """Identify a valve's model, Eqs. 12 and 16, from flow tests; what they do not show gets no number."""
+    from softloop.deploy.identify import identify_valve
+
+    return identify_valve(csv, tuple(columns or ()), discharge, temperature, as_json=as_json)
 
 
 @app.command()

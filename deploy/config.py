@@ -20,4 +20,6 @@ class RunConfig(Table):
     vent_timeout_s: float = Field(3.0, ge=0, description="at the end, wait no longer than this for the chamber to vent")
     vented_kpa: float = Field(2.0, gt=0, description="gauge pressure under which the chamber counts as vented")
     stop_timeout_s: float = Field(5.0, gt=0, description="a process that has not ended by then is killed")
+    rig: str = Field("", max_length=80, description="which rig this is, for parameter files; default: the bench's name")
+    foreign_parameters: bool = Field(False, description="run on a parameter file that was identified on another rig")
     report: bool = Field(True, description="write report.html and its pictures at the end")

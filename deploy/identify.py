@@ -10,20 +10,22 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from softloop.deploy.evidence import write_evidence
 from softloop.deploy.progress import counted_progress
 from softloop.dynamics.parameters import load_parameters, shipped
-from softloop.offline.identification.csv_map import parse_map, read_csv, read_vent
+from softloop.offline.identification.csv_map import parse_map, read_columns, read_csv, read_vent
 from softloop.offline.identification.experiments import halves
-from softloop.offline.identification.fitting import bare_of, fit_output_error
+from softloop.offline.identification.fitting import fit_output_error
 from softloop.offline.identification.intervals import Uncertainty, of_fit, of_regression
 from softloop.offline.identification.orders import compare
 from softloop.offline.identification.output_error import Fit, score
 from softloop.offline.identification.regression import as_fit, instrumental_variables, least_squares
 from softloop.offline.identification.series import Series, from_log
-from softloop.offline.identification.structure import PAPER, Structure
+from softloop.offline.identification.structure import PAPER, Structure, bare_of
+from softloop.offline.identification.valve_flow import FlowTests, fit_valve
 from softloop.offline.identification.venting import fit_vent, score_vent
 from softloop.offline.log import find_log, open_log
-from softloop.wire.errors import EXIT_OK, BadConfig
+from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ class Asked:
     method: str
     interval: str
     select: bool
+    output: Path | None
     figure: Path | None
     as_json: bool
 
@@ -64,6 +67,8 @@ def identify(asked: Asked) -> int:
         return _select(structure, train, validate, as_json=asked.as_json)
     fit, uncertainty = fitted(structure, train, asked.method, asked.interval)
     answer = Answer(fit, uncertainty, train, {v.name: score(fit, v) for v in validate})
+    if asked.output:
+        write_evidence(asked.output, asked.runs, fit, uncertainty, [train, *validate])
     if asked.figure:
         from softloop.offline.identification.figures import validation  # noqa: PLC0415 - matplotlib only where it draws
 
@@ -97,6 +102,28 @@ def identify_vent(files: tuple[Path, ...], columns: tuple[str, ...], trained: in
     for name, fit in scores.items():
         print(f"  {name} (unseen) {fit:.2f} %")
     return EXIT_OK
+
+
+def identify_valve(file: Path, columns: tuple[str, ...], discharge: float, temperature_k: float, *, as_json: bool) -> int:
+    """Fit a valve to flow tests and say it; EXIT_NEGATIVE when the tests do not show all of its numbers."""
+    taken = read_columns(file, parse_map(columns, ("current", "upstream", "downstream", "flow")))
+    found = fit_valve(FlowTests(*(taken[k] for k in ("current", "upstream", "downstream", "flow"))), discharge, temperature_k)
+    sure = found.uncertainty
+    rows: dict[str, dict[str, float]] = {}
+    if sure is not None:
+        rows = {
+            n: {"value": v, "low": a, "high": b} for n, v, a, b in zip(sure.names, sure.values, *sure.interval(), strict=True)
+        }
+    if as_json:
+        six = found.coefficients() if sure is not None else {}
+        print(json.dumps({"numbers": rows, "coefficients": six, "rank": found.rank, "fit": found.fit}, indent=2))
+    else:
+        print(f"flow fits {found.fit:.2f} % (NRMSE); rank {found.rank} of 5")
+        for name, row in rows.items():
+            print(f"{name} {row['value']:.4g} (95 %: {row['low']:.4g} to {row['high']:.4g})")
+        if sure is None:
+            print("not identifiable from these tests, so no number is given: vary both pressures, three or more of each")
+    return EXIT_OK if sure is not None else EXIT_NEGATIVE
 
 
 def fitted(structure: Structure, train: Series, method: str, interval: str) -> tuple[Fit, Uncertainty]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from softloop.deploy.bench import Bench
-from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, SoftloopError
+from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, BadConfig, SoftloopError
 from softloop.wire.shell import Stop
 
 PACKAGE = Path(__file__).resolve().parent.parent
@@ -79,11 +79,26 @@ def prepare(bench: Bench, run_dir: Path, progress: Progress) -> Prepared:
     """Warm, check, and put parameters and the CAN description beside the log. Raises as `check_controller` does."""
     modules = warm(progress, RUN_ROOMS)
     trajectory_s = check_controller(bench)
+    check_identity(bench)
     if bench.controller is not None:
         shutil.copyfile(_parameter_file(bench.controller.parameters), run_dir / "parameters.toml")
     dbc = Path(str(resources.files("softloop.devices.protocols") / "rig.dbc"))
     shutil.copyfile(dbc, run_dir / "rig.dbc")
     return Prepared(trajectory_s, modules)
+
+
+def check_identity(bench: Bench) -> None:
+    """That the controller's parameters were identified on this rig, where their file says on which. Raises BadConfig."""
+    if bench.controller is None or bench.run.foreign_parameters:
+        return
+    from softloop.controller.setup import parameters_of  # noqa: PLC0415 - likewise
+
+    evidence, rig = parameters_of(bench.controller).evidence, bench.run.rig or bench.name
+    if evidence is not None and evidence.rig != rig:
+        raise BadConfig(
+            f"parameters '{bench.controller.parameters}' were identified on rig '{evidence.rig}' and this is '{rig}' "
+            "(key 'run.rig', default the bench's name); to run on them all the same set run.foreign_parameters = true"
+        )
 
 
 def _parameter_file(named: str) -> Path:

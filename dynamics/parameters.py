@@ -108,6 +108,35 @@ class Pneumatics(Table):
     leak_m2: Bounded
 
 
+class EvidenceRun(Table):
+    """One run that the values were fitted to or tried on."""
+
+    name: str
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="of the log file")
+    start_s: float = Field(description="the window that counted, from the run's first tick")
+    end_s: float
+    fit_percent: float = Field(description="NRMSE fit of a free simulation")
+    trained: bool
+
+
+class Evidence(Table):
+    """Where the bending values come from. Their bounds are three standard errors, as in the paper."""
+
+    rig: str = Field(description="identity of the rig, as its bench says it: run.rig, or the bench's name")
+    method: str = Field(description="estimator, and what its residuals were taken for")
+    softloop: str = Field(description="version that identified")
+    parameters: tuple[str, ...] = Field(description="order of the covariance")
+    covariance: tuple[tuple[float, ...], ...]
+    runs: tuple[EvidenceRun, ...]
+
+    @model_validator(mode="after")
+    def _square(self) -> Evidence:
+        size = len(self.parameters)
+        if len(self.covariance) != size or any(len(row) != size for row in self.covariance):
+            raise ValueError(f"covariance must be {size} by {size}, the number of its parameters")
+        return self
+
+
 class Parameters(Table):
     """A parameter file."""
 
@@ -116,6 +145,7 @@ class Parameters(Table):
     charge: Valve
     exhaust: Valve
     pneumatics: Pneumatics
+    evidence: Evidence | None = None
 
     @model_validator(mode="after")
     def _usable(self) -> Parameters:

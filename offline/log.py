@@ -41,7 +41,7 @@ CanKey = tuple[str, int]
 
 _MESSAGE_HEAD = 22  # channel id u16, sequence u32, log time u64, publish time u64
 _LZ4_RATIO_MAX = 260  # LZ4 cannot expand more than 255 times; zstd's window is bounded by _CHUNK_MAX alone
-_CHUNK_MAX = 1 << 30
+_CHUNK_MAX, _SORT_BYTES = 1 << 30, 4 << 20
 # What a damaged record can raise while it is parsed.
 DAMAGE = (McapError, struct.error, ValueError, KeyError, RuntimeError, OverflowError, MemoryError, EOFError, zstandard.ZstdError)
 _SILENT = {Opcode.HEADER, Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX}
@@ -163,7 +163,8 @@ class _Reader:
         self.topics: dict[int, Channel] = {}
         self.rows: dict[int, list[Bytes]] = {}  # channel id -> blocks (n, payload length), in the order of the file
         self.counts: dict[int, int] | None = None  # as the file's own statistics say
-        self._found = np.empty((4096, 4), np.int64)
+        self._waiting: list[tuple[Bytes, NDArray[np.int64]]] = []  # good chunks with their messages
+        self._waiting_bytes, self._found = 0, np.empty((4096, 4), np.int64)
         self._handlers: dict[int, Callable[[bytes], None]] = {
             Opcode.CHUNK: self._chunk,
             Opcode.SCHEMA: self._schema,
@@ -179,16 +180,16 @@ class _Reader:
         for opcode, at, content in records:
             if opcode in _SILENT:
                 continue
-            handler = self._handlers.get(opcode)
-            if handler is None:
+            if opcode not in self._handlers:
                 self._problem(f"unknown record {opcode} at byte {at}, {len(content)} bytes left out")
                 continue
             try:
-                handler(bytes(content))
+                self._handlers[opcode](bytes(content))
             except DAMAGE as error:
                 self._problem(f"damaged {Opcode(opcode).name.lower()} at byte {at}, left out: {_first_line(error)}")
                 records.damaged()
         self._say_what_is_cut(records, len(view))
+        self._sort_waiting()
         self._resolve()
         self._check_counts()
         return self.log
@@ -223,11 +224,23 @@ class _Reader:
             handler = {Opcode.SCHEMA: self._schema, Opcode.CHANNEL: self._channel}.get(opcode)
             if handler is not None:
                 handler(data[start : start + length].tobytes(), sure=True)
-        self._keep(data, found[found[:, 0] == Opcode.MESSAGE])
+        messages = found[found[:, 0] == Opcode.MESSAGE]
+        messages[:, 2] += self._waiting_bytes
+        self._waiting.append((data, messages))
+        self._waiting_bytes += data.size
+        if self._waiting_bytes >= _SORT_BYTES:
+            self._sort_waiting()
+
+    def _sort_waiting(self) -> None:
+        """Keep the messages of several chunks at once: numpy's cost per call is shared."""
+        if self._waiting:
+            chunks, found = zip(*self._waiting, strict=True)
+            self._waiting, self._waiting_bytes = [], 0
+            self._keep(np.concatenate(chunks), np.concatenate(found))
 
     def _keep(self, data: Bytes, found: NDArray[np.int64]) -> None:
         """Copy messages as rows, one block per channel and length."""
-        for channel_id in np.unique(found[:, 1]).tolist():
+        for channel_id in np.flatnonzero(np.bincount(found[:, 1])).tolist():
             of_channel = found[found[:, 1] == channel_id]
             lengths = of_channel[:, 3]
             if (lengths == lengths[0]).all():
@@ -247,6 +260,7 @@ class _Reader:
 
     def _message(self, content: bytes) -> None:
         """A message outside any chunk."""
+        self._sort_waiting()
         (channel_id,) = struct.unpack_from("<H", content)
         data = np.frombuffer(content, np.uint8)
         if data.size < _MESSAGE_HEAD:

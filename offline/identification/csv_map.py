@@ -74,8 +74,8 @@ def read_csv(path: Path, columns: Map) -> Series:
     return series
 
 
-def read_vent(path: Path, columns: Map) -> Vent:
-    """One file as a venting. Raises BadFile as `read_csv` does."""
+def read_columns(path: Path, columns: Map) -> dict[str, Floats]:
+    """The first column of each key, (n,). Raises BadFile as `read_csv` does."""
     table = _table(path)
     missing = sorted({c.name for group in columns.values() for c in group} - set(table))
     if missing:
@@ -84,6 +84,12 @@ def read_vent(path: Path, columns: Map) -> Vent:
     bad = np.flatnonzero(~np.isfinite(np.column_stack(list(taken.values()))).all(axis=1))
     if len(bad):
         raise BadFile(f"{path}: row {bad[0] + 2} holds no number where one is needed")
+    return taken
+
+
+def read_vent(path: Path, columns: Map) -> Vent:
+    """One file as a venting. Raises BadFile as `read_csv` does."""
+    taken = read_columns(path, columns)
     back = np.flatnonzero(np.diff(taken["time"]) <= 0)
     if len(back):
         raise BadFile(f"{path}: row {back[0] + 3}: time must rise from row to row")

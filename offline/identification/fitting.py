@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from softloop.offline.identification.output_error import Fit, Problem, first_states, solve
 from softloop.offline.identification.regression import as_fit, least_squares, low_pass
 from softloop.offline.identification.series import Series
-from softloop.offline.identification.structure import Structure, carry_over
+from softloop.offline.identification.structure import Structure, bare_of, carry_over
 from softloop.wire.errors import BadConfig
 
 Floats = NDArray[np.float64]
@@ -77,11 +77,6 @@ def fit_output_error(structure: Structure, experiments: Sequence[Series], begin:
         _begin_memory(values, fit.structure, step, problem)
         fit = solve(problem, values, fit.starts, iterations)
     return fit
-
-
-def bare_of(structure: Structure) -> Structure:
-    """The structure without any option."""
-    return Structure(structure.m, structure.n, structure.r, structure.inputs)
 
 
 def _steps(old: Structure, new: Structure) -> list[Structure]:

@@ -92,6 +92,11 @@ PAPER = Structure()
 LINEAR = Structure(m=0, n=0, r=0)  # Eq. 1, with the constant d that a rest angle needs
 
 
+def bare_of(structure: Structure) -> Structure:
+    """The structure without any option."""
+    return Structure(structure.m, structure.n, structure.r, structure.inputs)
+
+
 def d_at_rest(structure: Structure, values: Floats, pressure_kpa: Floats) -> float:
     """The d at which the first state of `values` is one of rest under the pressures (inputs,), deg/s2."""
     y, poly = float(values[-2]), np.polynomial.polynomial.polyval

@@ -1,0 +1,100 @@
+"""A parameter file that says where its values come from: bounds, covariance, the logs by their hashes, fits, version, rig."""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+from pydantic import ValidationError
+
+from softloop.dynamics.parameters import Parameters, shipped
+from softloop.offline.identification.intervals import Uncertainty
+from softloop.offline.identification.output_error import Fit, score
+from softloop.offline.identification.series import Series
+from softloop.offline.identification.structure import PAPER, bare_of
+from softloop.offline.log import Log, find_log, open_log
+from softloop.wire.benchfile import validated
+from softloop.wire.errors import BadConfig, BadFile
+
+BOUND_ERRORS = 3.0  # "three standard deviations of the means", as the paper has it
+
+
+def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty, series: Sequence[Series]) -> None:
+    """Write the parameter file of a fit to logs; what was not identified is as the first log's own parameters have it.
+
+    Args:
+        file: where to.
+        runs: the logs; the first one's halves are the first two of `series`.
+        fit, sure: of the paper's structure, with any options: the controller takes the bending values alone.
+        series: what was trained on, first, and tried on.
+
+    Raises:
+        BadConfig: the structure is another, or the values make no usable parameter file.
+        BadFile: the file cannot be written, or the values come from no log.
+    """
+    if not runs or bare_of(fit.structure) != PAPER:
+        raise BadConfig("--output needs logs, orders 2,0,3 and one pressure: that is the model which the controller has")
+    log = open_log(find_log(runs[0]))
+    content = _base(log)
+    content |= {"name": file.stem, "bending": _bending(sure)}
+    content["evidence"] = _evidence([runs[0], *runs], log, fit, sure, series)
+    try:
+        validated(Parameters, content)
+    except ValidationError as error:
+        raise BadConfig(f"{file}: the values make no usable parameters: {error.errors()[0]['msg']}") from None
+    try:
+        file.write_text(tomlkit.dumps(content), encoding="utf-8")
+    except OSError as error:
+        raise BadFile(f"{file}: cannot be written: {error.strerror or error}") from None
+
+
+def rig_of(log: Log) -> str:
+    """The identity of the rig that a log is of."""
+    try:
+        run = tomllib.loads(log.text("bench.toml")).get("run", {})
+    except tomllib.TOMLDecodeError:
+        run = {}
+    return str(run.get("rig") or log.bench)
+
+
+def _base(log: Log) -> dict[str, Any]:
+    try:
+        return tomllib.loads(log.text("parameters.toml") or shipped().read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise BadFile(f"{log.path}: its parameter file cannot be read: {error}") from None
+
+
+def _bending(sure: Uncertainty) -> dict[str, dict[str, float]]:
+    half = BOUND_ERRORS * sure.errors
+    rows = zip(sure.names, sure.values.tolist(), half.tolist(), strict=True)
+    return {n: {"value": v, "min": v - h, "max": v + h} for n, v, h in rows if n in PAPER.names}
+
+
+def _evidence(runs: Sequence[Path], log: Log, fit: Fit, sure: Uncertainty, series: Sequence[Series]) -> dict[str, Any]:
+    kept = [sure.names.index(name) for name in PAPER.names]
+    return {
+        "rig": rig_of(log),
+        "method": f"{fit.structure}, {sure.method}",
+        "softloop": metadata.version("softloop"),
+        "parameters": list(PAPER.names),
+        "covariance": sure.covariance[np.ix_(kept, kept)].tolist(),
+        "runs": [_run(path, fit, s, trained=i == 0) for i, (path, s) in enumerate(zip(runs, series, strict=True))],
+    }
+
+
+def _run(path: Path, fit: Fit, series: Series, *, trained: bool) -> dict[str, Any]:
+    counted = series.time_s[series.counted]
+    return {
+        "name": series.name,
+        "sha256": hashlib.sha256(find_log(path).read_bytes()).hexdigest(),
+        "start_s": float(counted[0]),
+        "end_s": float(counted[-1]),
+        "fit_percent": fit.fits[0] if trained else score(fit, series),
+        "trained": trained,
+    }
