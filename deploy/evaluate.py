@@ -46,7 +46,7 @@ _COLUMNS = {
     "on T2": "t2_switches_per_s",
     "effort": "t2_effort_ma_s",
 }
-_WIDTH = 190  # wider than most terminals, so that a page can show it whole
+_WIDTH = 210  # wider than most terminals, so that a page can show it whole
 _KEPT = {"bars": "bars_kept", "load": "payload_kept", "quiet": "quiet", "paper": "paper_kept"}
 _SHARE_OF_RIGS = 0.9  # of the rigs on which the bars must hold: 18 of 20
 
@@ -112,7 +112,7 @@ def show(verdicts: Sequence[Verdict], latency: dict[str, float], confirmed: list
         table = Table(title=title, title_justify="left")
         table.add_column("law, tuned at ms", no_wrap=True)
         for head in (*_COLUMNS, *_KEPT):
-            table.add_column(head, justify="right")
+            table.add_column(head, justify="right", no_wrap=True)
         for verdict in (v for v in verdicts if v.condition == condition):
             at = "defaults" if verdict.tuned_at_ms is None else f"at +{verdict.tuned_at_ms:g}"
             table.add_row(f"{verdict.law} {at}", *_row(verdict))
@@ -127,8 +127,12 @@ def show(verdicts: Sequence[Verdict], latency: dict[str, float], confirmed: list
 
 def _row(verdict: Verdict) -> list[str]:
     found = figures(verdict.judged)
-    cells = [f"{found[name]['worst']:.3g} ({found[name]['median']:.3g})" for name in _COLUMNS.values()]
+    cells = [f"{_short(found[name]['worst'])} ({_short(found[name]['median'])})" for name in _COLUMNS.values()]
     return cells + [f"{found[name]}/{found['rigs']}" for name in _KEPT.values()]
+
+
+def _short(value: float) -> str:
+    return f"{value:.2f}" if value < 10.0 else f"{value:.1f}" if value < 100.0 else f"{value:.0f}"
 
 
 def draw(laws: Sequence[str], seed: int, folder: Path) -> None:

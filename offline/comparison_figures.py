@@ -24,11 +24,11 @@ _STYLE: Any = {
     "legend.frameon": False,
 }
 _ROWS = ("angle, deg", "error, deg", "chamber, kPa", "mode")
-_ERROR_SHOWN_DEG = 6.0  # the paper's Figs. 6 and 7 span about this
+_ERROR_SHOWN_DEG = 2.0
 
 
 def side_by_side(runs: Mapping[str, Run], title: str) -> Figure:
-    """One column per law; errors are cut at +-6 deg, which the page says where it happens."""
+    """One column per law; errors are cut at +-2 deg."""
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(2.6 * len(runs), 6.5), dpi=DPI, layout="constrained")
         FigureCanvasAgg(figure)
