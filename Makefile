@@ -19,6 +19,7 @@ help:
 	@echo 'make exact  set up, then the three exactness contracts for every law, with both cores kept busy'
 	@echo 'make test-page  the live page in a real browser (Debian: apt install chromium)'
 	@echo 'make docs   the documentation as pages, in docs/_build/html'
+	@echo 'make kill, make mutate, make fuzz   the long campaigns, see docs/campaigns.md'
 	@echo 'make lint   ruff, mypy and the rules of who may import whom'
 	@echo 'make lock   compute requirements.lock again from pyproject.toml'
 	@echo 'make clean  remove the environment, caches and built files; runs/ stays'
@@ -50,6 +51,18 @@ test-page: $(STAMP)
 	@test -x '$(CHROMIUM)' || { echo 'make: no browser at $(CHROMIUM); install chromium, or make CHROMIUM=PATH' >&2; exit 3; }
 	$(BIN)/softloop warm
 	$(BIN)/python -m pytest tests/page --chromium '$(CHROMIUM)'
+
+# The long campaigns: counts on the screen, JSON under build/campaigns, exit code 1 on a failure. A hundredth of each is in `test`.
+kill: $(STAMP)
+	$(BIN)/softloop warm
+	$(BIN)/python -m tests.campaigns.kill
+
+mutate: $(STAMP)
+	$(BIN)/python -m tests.campaigns.mutate
+
+fuzz: $(STAMP)
+	$(BIN)/softloop warm
+	$(BIN)/python -m tests.campaigns.fuzz
 
 exact: $(STAMP)
 	$(BIN)/softloop warm

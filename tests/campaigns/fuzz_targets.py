@@ -8,9 +8,12 @@ import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
+
 from softloop.deploy.bench import load_bench, shipped_benches
 from softloop.devices import gate as g
 from softloop.devices.config import InclinometerConfig
+from softloop.devices.gate_messages import COMMAND as COMMAND_DTYPE
 from softloop.devices.protocols import can_frames, wt931
 from softloop.devices.protocols.can_frames import E2eReceiver, e2e_crc
 from softloop.devices.protocols.quantise import counts_to_deg
@@ -126,9 +129,14 @@ def cdr(data):
 def _ask(bench, data):
     """Give `data` to a gate as its process would."""
     now_ns = bench.now_ns + 5_000_000
+    records = [None, None, np.zeros(1, g.GATE_INPUT)]
+    records[2][0] = bench.given
+    bench.given = records[2][0]
+    command = np.zeros(1, COMMAND_DTYPE)
     loop = SimpleNamespace(
-        status=SimpleNamespace(dropped=0), commands=SimpleNamespace(take_all=list), given=bench.given, wait_ns=0, tick=0
-    )
+        status=SimpleNamespace(dropped=0), commands=SimpleNamespace(take_all=list), given=bench.given, records=records,
+        command=command, command_bytes=command.view("u1"), wait_ns=0, tick=0,
+    )  # fmt: skip
     bench.given.command_new = bench.given.stop = bench.given.arm = 0
     ValvesLoop._take_newest(loop, data, now_ns)
     bench.given.now_ns = bench.given.driver_stamp_ns = now_ns

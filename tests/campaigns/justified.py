@@ -4,10 +4,12 @@ JUSTIFIED = {
     "gate": {},
     "watchdog": {
         "accept_command: if driver.waiting > 0: -> if driver.waiting >= 0:": (
-            "With an empty queue the place before is that of the frame applied last, whose due time the physics has reached; a frame "
-            "is due at the later of its own due time and the time of the physics, so that nothing changes."
+            "With an empty queue the place before is that of the frame applied last, whose due time the physics has reached; a "
+            "frame is due at the later of its own due time and the time of the physics, so that nothing changes."
         ),
-        "_apply_frame: events[n - 1].raw[0] = DRIVER_OK -> pass": "DRIVER_OK is 0, and _write has just set the event's numbers to 0.",
+        "_apply_frame: events[n - 1].raw[0] = DRIVER_OK -> pass": (
+            "DRIVER_OK is 0, and _write has just set the event's numbers to 0."
+        ),
         "_apply_frame: events[n - 1].raw[0] = DRIVER_OK -> events[n - 1].raw[1] = DRIVER_OK": (
             "DRIVER_OK is 0, and _write has just set the event's numbers to 0."
         ),

@@ -2,9 +2,9 @@
 
     python -m tests.campaigns.mutate [--one-in 1] [--module gate] [--seed 1] [--json FILE]
 
-Kernels run as plain Python here. Each mutant lives in a process of its own, forked from one that has loaded all but the module in
-question and what imports it; the tests of that module run in it, until the first one fails. One that does not end in time counts
-as killed too, and is counted apart.
+Kernels run as plain Python here. Each mutant lives in a process of its own, forked from one that has loaded everything; there it
+takes the place of the module's functions, and the tests run until the first one fails. One that does not end in time counts as
+killed too, and is counted apart.
 """
 
 import ast
@@ -16,29 +16,21 @@ import random
 import resource
 import signal
 import sys
-import types
 from dataclasses import dataclass
 from pathlib import Path
 
 os.environ["NUMBA_DISABLE_JIT"] = "1"  # before numba is loaded
 
 import hypothesis
-import numba  # noqa: F401 - this and what follows is loaded before the forks, for speed; none of it imports a target
+import numba  # noqa: F401 - this and the tests are loaded before the forks, for speed
 import pytest
 import scipy.optimize  # noqa: F401
 
-import softloop.devices.config
-import softloop.devices.protocols.quantise_kernels
-import softloop.devices.protocols.wt931
-import softloop.plant.config
-import softloop.plant.loads
-import softloop.plant.physics
-import softloop.plant.records
-import softloop.plant.truth
-import softloop.wire.can_config  # noqa: F401
 from tests.campaigns.justified import JUSTIFIED
 from tests.campaigns.mutants import mutants_of
 from tests.campaigns.outcome import Outcome, options, steps
+from tests.devices import test_gate, test_gate_sequences  # noqa: F401
+from tests.plant import test_watchdog  # noqa: F401
 
 LIMIT_S = 60  # of processor time
 KILLED, SURVIVED = 1, 0
@@ -95,12 +87,9 @@ def _be_mutant(target, tree, file):
         os.dup2(nowhere.fileno(), 1)
         os.dup2(nowhere.fileno(), 2)
     try:
-        package, name = target.module.rsplit(".", 1)
-        module = types.ModuleType(target.module)
-        module.__file__, module.__package__ = str(file), package
-        sys.modules[target.module] = module
+        # Into the module that is loaded: its functions find each other, and the tests find them, by the module's names.
+        module = importlib.import_module(target.module)
         exec(compile(tree, str(file), "exec"), module.__dict__)
-        setattr(importlib.import_module(package), name, module)
     except Exception:  # noqa: BLE001 - a mutant that cannot be loaded is dead
         return KILLED
     with contextlib.redirect_stdout(io.StringIO()):

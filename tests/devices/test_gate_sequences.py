@@ -78,10 +78,11 @@ class GateMachine(RuleBasedStateMachine):
 
     @initialize()
     def start(self):
-        self.bench, self.armed, self.latched, self.used = GateBench(), False, False, 0
+        self.bench, self.armed, self.latched, self.silent = GateBench(), False, False, 0
         self.last = self.bench.tick()
 
     def step(self, ask=False, **fields):
+        self.silent = 0 if fields.get("command", True) else self.silent + 1
         self.last = self.bench.arm(**fields) if ask else self.bench.tick(**fields)
 
     @rule()
@@ -122,9 +123,9 @@ class GateMachine(RuleBasedStateMachine):
 
     @rule(ticks=st.integers(1, 10))
     def silence(self, ticks):
-        for k in range(1, ticks + 1):
+        for _ in range(ticks):
             self.step(command=False)
-            if k == 4:  # 3 ticks are held
+            if self.silent == 4:  # 3 ticks are held
                 self.latched |= self.armed
                 self.armed = False
 

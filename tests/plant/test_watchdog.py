@@ -7,7 +7,7 @@ from softloop.plant import electrical as e
 from softloop.plant.records import EVENT, EVENT_DRIVER, QUEUE
 from tests.plant.rigs import MS, Rig
 
-SOURCES = ("next_load_ns", "next_echo_ns", "next_analog_ns", "next_inclinometer_ns", "next_truth_ns")
+SOURCES = ("next_load_ns", "next_fault_ns", "next_echo_ns", "next_analog_ns", "next_inclinometer_ns", "next_truth_ns")
 
 
 @pytest.fixture
@@ -122,6 +122,34 @@ def test_the_watchdog_vents_once_and_says_so(rig):
     event = events[1]
     assert (event["kind"], event["sample_ns"], event["end_ns"]) == (EVENT_DRIVER, 20 * MS, 20 * MS)
     assert event["raw"].tolist() == [e.DRIVER_WATCHDOG, 0, 0, 0]
+
+
+@pytest.mark.parametrize("fault", ["commands_lost", "power_lost"])
+def test_a_frame_that_does_not_reach_the_driver_changes_nothing(rig, fault):
+    state, driver = rig.state, rig.state.driver
+    driver.state, driver.seq, driver.head = e.DRIVER_WATCHDOG, 3, QUEUE - 1
+    state.broken[fault] = 1
+    accept(rig, 7 * MS, 9000, 100, 1, 8)
+    accept(rig, 8 * MS, 9000, 100, 1, 9)
+    before = (float(state.command_charge_ma), float(state.command_exhaust_ma))
+    n, events = apply(rig, 2)
+    assert n == 2
+    assert events["raw"].tolist() == [[99] * 4] * 8
+    assert (driver.head, driver.waiting, driver.seq, driver.accepted) == (0, 1, 3, 0)
+    assert (driver.state, driver.watchdog_at_ns) == (e.DRIVER_WATCHDOG, e.NEVER_NS)
+    assert (state.command_charge_ma, state.command_exhaust_ma) == before != (90.0, 1.0)
+
+
+def test_a_watchdog_without_power_cannot_vent(rig):
+    state, events = rig.state, np.zeros(4, EVENT)
+    events["raw"] = 99
+    accept(rig, 0, 9000, 0)
+    apply(rig)
+    state.broken.power_lost = 1
+    assert e._watchdog(rig.params, state, events, 1) == 1
+    assert (state.command_charge_ma, state.command_exhaust_ma) == (90.0, 0.0)
+    assert (state.driver.state, state.driver.watchdog_at_ns) == (e.DRIVER_OK, e.NEVER_NS)
+    assert events["raw"].tolist() == [[99] * 4] * 4
 
 
 def test_new_currents_reach_the_physics(rig):
