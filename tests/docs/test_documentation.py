@@ -35,7 +35,7 @@ ALL = [(page.name, command) for page in PAGES for command in commands_in(page)]
 
 
 def test_there_are_commands():
-    assert len(ALL) > 30
+    assert len(ALL) > 20
     assert {"tutorial.md", "watching.md", "live-page.md"} <= {name for name, _ in ALL}
 
 
@@ -65,7 +65,7 @@ def tutorial_commands():
             yield pytest.param(command, id=f"{name} {' '.join(command)}")
 
 
-@pytest.mark.parametrize("command", tutorial_commands())
+@pytest.mark.parametrize("command", list(tutorial_commands()))
 def test_a_command_without_a_rig_does_what_the_page_says(command, runs):
     words = [str(runs / STANDS_FOR[word]) if word in STANDS_FOR else word for word in command]
     done = subprocess.run(
