@@ -97,7 +97,7 @@ def rig_tables(bench: Bench) -> RigTables:
     if plant is None or valves is None or pressures is None or inclinometer is None or controller is None:
         needed = ("plant", "valves", "pressures", "inclinometer", "controller")
         missing = ", ".join(f"[{name}]" for name in needed if getattr(bench, name) is None)
-        raise BadConfig(f"bench '{bench.name}' has no {missing}: a campaign needs a whole simulated rig")
+        raise BadConfig(f"bench '{bench.name}' has no {missing}: a run in one process needs a whole simulated rig")
     return RigTables(controller, plant, valves, pressures, inclinometer, bench.can, bench.pace)
 
 

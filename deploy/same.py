@@ -6,10 +6,11 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+from softloop.deploy.batch import rig_tables
 from softloop.deploy.bench import Bench, load_bench
 from softloop.deploy.launcher import schedule_of
 from softloop.deploy.run_dir import BENCH_FILE
-from softloop.offline.closed_loop import RigTables, Trace, ready_controller, simulate_trace
+from softloop.offline.closed_loop import Trace, ready_controller, simulate_trace
 from softloop.offline.log import Log, find_log, open_log
 from softloop.offline.same import Apart, compare, differences, series_of
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
@@ -40,21 +41,11 @@ def same_runs(first: Path, second: Path | None, *, as_json: bool) -> int:
     return EXIT_NEGATIVE if found else EXIT_OK
 
 
-def tables_of(bench: Bench) -> RigTables:
-    """The tables that a run in one process needs. Raises BadConfig where one is missing."""
-    needed = ("controller", "plant", "valves", "pressures", "inclinometer")
-    found = {name: getattr(bench, name) for name in needed}
-    missing = [name for name, table in found.items() if table is None]
-    if missing:
-        raise BadConfig(f"bench '{bench.name}': a run in one process needs [{'], ['.join(missing)}]")
-    return RigTables(**found, can=bench.can, pace=bench.pace)
-
-
 def trace_of(bench: Bench) -> Trace:
     """What a bench leaves at lockstep pace, computed in this process. Raises BadFile or BadConfig."""
     if bench.pace.mode != "lockstep":
         raise BadConfig(f"bench '{bench.name}': its run was not at lockstep pace, and only such a run can be made again")
-    tables = tables_of(bench)
+    tables = rig_tables(bench)
     built = ready_controller(tables.controller)
     return simulate_trace(tables, schedule_of(bench, built.plan.duration_s), built)
 

@@ -20,10 +20,9 @@ from scipy.stats import binomtest
 from scipy.stats import t as student
 
 from softloop.dynamics.parameters import load_parameters, shipped
-from softloop.offline.identification.experiments import FAST, data_sets, excite, halves
+from softloop.offline.identification.experiments import FAST, excite, halves
 from softloop.offline.identification.fitting import fit_output_error
 from softloop.offline.identification.intervals import LEVEL, Uncertainty, of_fit, of_regression
-from softloop.offline.identification.output_error import Fit, score
 from softloop.offline.identification.regression import instrumental_variables, least_squares
 from softloop.offline.identification.series import Series
 from softloop.offline.identification.structure import PAPER
@@ -164,16 +163,3 @@ def _table(mean_held: Any, scatter_held: Any, errors: Any, spreads: Any) -> dict
         name: {key: float(s * column[i]) for key, s, column in zip(keys, scale, columns, strict=True)}
         for i, name in enumerate(PAPER.names)
     }
-
-
-def fits_over_seeds(seeds: range, structures: dict[str, Any], progress: Progress) -> dict[str, list[tuple[float, float, float]]]:
-    """NRMSE fit on Data1, Data2 and Data3 of each rig for each structure, %, from models fitted to Data1 alone."""
-    out: dict[str, list[tuple[float, float, float]]] = {name: [] for name in structures}
-    for done, seed in enumerate(seeds):
-        progress(done, len(seeds))
-        data = data_sets(PlantConfig(layer="rig", seed=seed), seed)
-        for name, structure in structures.items():
-            fit: Fit = fit_output_error(structure, [data.data1])
-            out[name].append((fit.fits[0], score(fit, data.data2), score(fit, data.data3)))
-    progress(len(seeds), len(seeds))
-    return out

@@ -1,24 +1,13 @@
-"""The excitation experiments of the paper, in one process: the pressure law on its multi-sines, and their three data sets."""
+"""The excitation experiments of the paper, in one process: the pressure law on its multi-sines, in halves: Data1 and Data2."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 from softloop.controller.config import ControllerConfig
 from softloop.offline.closed_loop import simulate_run
 from softloop.offline.identification.series import Series, from_cycles
 from softloop.plant.config import PlantConfig
 
-FAST, SLOW = "excitation_1hz", "excitation_05hz"
-
-
-@dataclass(frozen=True)
-class DataSets:
-    """Data1 and Data2 are the halves of the [0, 1] Hz run, Data3 is the [0, 0.5] Hz run."""
-
-    data1: Series
-    data2: Series
-    data3: Series
+FAST = "excitation_1hz"
 
 
 def halves(run: Series) -> tuple[Series, Series]:
@@ -30,10 +19,3 @@ def excite(trajectory: str, plant: PlantConfig, trajectory_seed: int, parameters
     """One simulated run of the pressure law; `parameters` is what the law believes."""
     controller = ControllerConfig(law="pressure", trajectory=trajectory, trajectory_seed=trajectory_seed, parameters=parameters)
     return from_cycles(simulate_run(controller, plant).cycles, f"{trajectory}, rig {plant.seed}")
-
-
-def data_sets(plant: PlantConfig, trajectory_seed: int) -> DataSets:
-    """All three data sets of a simulated rig."""
-    data1, data2 = halves(excite(FAST, plant, trajectory_seed))
-    slow = excite(SLOW, plant, trajectory_seed)
-    return DataSets(data1, data2, slow.part("Data3", 0.0, 1.0))

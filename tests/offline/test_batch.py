@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from math import inf
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -228,4 +229,4 @@ def _wait_for_workers(pid, wanted=3, timeout_s=60.0):
 
 
 def test_the_shipped_bench_is_a_whole_rig():
-    assert isinstance(rig_tables(load_bench(find_bench("sim"))).controller, ControllerConfig)
+    assert isinstance(rig_tables(load_bench(find_bench(Path("sim")))).controller, ControllerConfig)
