@@ -5,18 +5,31 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
+from typer.core import TyperGroup
 
-from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_OK, EXIT_USAGE, SoftloopError
+from softloop.wire.errors import EXIT_LOST, EXIT_OK, EXIT_USAGE, Interrupted, SoftloopError
 
 EXIT_CODES = """Exit codes: 0 all is well; 1 the command ran and its answer is no (a gate fault, a difference, a refused request);
 2 a bad argument or a bad file; 3 the machine (an address in use, a device or permission that is missing);
 4 a process or a wire was lost while running; 130 interrupted."""
 
+
+class Commands(TyperGroup):
+    """All commands; Ctrl-C in one is an error like others, so that it is said in one line."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise Interrupted("interrupted") from None
+
+
 app = typer.Typer(
     name="softloop",
+    cls=Commands,
     help="Hardware-in-the-loop control of pneumatic soft bending actuators over Zenoh and CAN.",
     epilog=EXIT_CODES,
     add_completion=False,
@@ -421,8 +434,6 @@ def _run(arguments: list[str]) -> int:
         code = app(arguments, standalone_mode=False)
     except SoftloopError as error:
         return _complain(str(error), error.exit_code)
-    except (KeyboardInterrupt, typer.Abort):
-        return _complain("interrupted", EXIT_INTERRUPTED)
     except BrokenPipeError:
         sys.stderr.close()  # whoever read our output is gone; nothing more can be said
         return EXIT_LOST

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from softloop.deploy.bench import Bench
-from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, BadConfig, SoftloopError
+from softloop.wire.errors import EXIT_LOST, BadConfig, Interrupted, SoftloopError
 from softloop.wire.shell import Stop
 
 PACKAGE = Path(__file__).resolve().parent.parent
@@ -27,12 +27,6 @@ ROOMS = (*RUN_ROOMS, "offline")
 POLL_S = 0.05
 
 Progress = Callable[[str, int, int], None]  # module, how many are done, how many there are
-
-
-class Interrupted(SoftloopError):
-    """A person or the system asked to end."""
-
-    exit_code = EXIT_INTERRUPTED
 
 
 @dataclass(frozen=True)

@@ -34,3 +34,9 @@ class Lost(SoftloopError):
     """A process or a wire that went away while running."""
 
     exit_code = EXIT_LOST
+
+
+class Interrupted(SoftloopError):
+    """A person or the system asked to end."""
+
+    exit_code = EXIT_INTERRUPTED
