@@ -61,6 +61,7 @@ class Wanted:
     trajectories: tuple[str, ...] = ()
     jobs: int = 1
     payload: bool = False
+    tuned: bool = False
     scheduler: str | None = None
     out: Path | None = None
     as_json: bool = False
@@ -73,7 +74,7 @@ def batch(bench_file: Path, wanted: Wanted) -> int:
     seeds = seeds_of(wanted.seeds)
     laws, trajectories = wanted.laws or (tables.controller.law,), wanted.trajectories or (tables.controller.trajectory,)
     check_laws(laws)
-    cases = plan_cases(laws, trajectories, seeds, payload=wanted.payload)
+    cases = plan_cases(laws, trajectories, seeds, payload=wanted.payload, tuned=wanted.tuned)
     for case in {c.group: c for c in cases}.values():
         ready_controller(case_tables(tables, case)[0].controller)  # what is wrong with it is said before a worker begins
     folder = _make_folder(bench, wanted.out)

@@ -179,6 +179,7 @@ def batch(
     law: Annotated[list[str] | None, typer.Option(help="Instead of the bench's; several with commas, or again.")] = None,
     trajectory: Annotated[list[str] | None, typer.Option(help="Likewise: t1, t2, or the path of a CSV file.")] = None,
     payload: Annotated[bool, typer.Option("--payload", help="Each run once more, with a payload that comes and leaves.")] = False,
+    tuned: Annotated[bool, typer.Option("--tuned", help="Each law with its shipped tuned gains, not the bench's.")] = False,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Work on the Dask cluster of this scheduler.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/<bench>-batch-<UTC time>.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
@@ -188,7 +189,7 @@ def batch(
     from softloop.deploy.batch import batch as run_batch
 
     laws, trajectories = (tuple(name for text in given or () for name in text.split(",")) for given in (law, trajectory))
-    return run_batch(bench, Wanted(seeds, laws, trajectories, jobs, payload, scheduler, out, as_json))
+    return run_batch(bench, Wanted(seeds, laws, trajectories, jobs, payload, tuned, scheduler, out, as_json))
 
 
 @app.command()

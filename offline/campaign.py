@@ -12,6 +12,7 @@ import numpy as np
 from softloop.controller.config import ControllerConfig
 from softloop.controller.setup import plan_of
 from softloop.offline.closed_loop import SETTLE_S, RigTables, simulate_tables
+from softloop.offline.evaluation import tuned
 from softloop.offline.metrics import Floats
 from softloop.offline.scores import Scores, run_scores
 from softloop.offline.summary import PAPER_T1, PAPER_T2
@@ -45,6 +46,7 @@ class Case:
     trajectory: str
     seed: int
     payload: bool = False
+    tuned: bool = False  # the law's shipped tuned `[controller]`, not the bench's
 
     @property
     def group(self) -> Group:
@@ -102,15 +104,18 @@ class Verdict:
     influences: list[tuple[str, float]]
 
 
-def plan_cases(laws: Sequence[str], trajectories: Sequence[str], seeds: Iterable[int], *, payload: bool) -> list[Case]:
+def plan_cases(
+    laws: Sequence[str], trajectories: Sequence[str], seeds: Iterable[int], *, payload: bool, tuned: bool = False
+) -> list[Case]:
     """All runs of a campaign, group by group: without the payload, and where it is asked for with it too."""
     kinds = (False, True) if payload else (False,)
-    return [Case(law, t, seed, with_it) for with_it in kinds for t in trajectories for law in laws for seed in seeds]
+    return [Case(law, t, seed, with_it, tuned) for with_it in kinds for t in trajectories for law in laws for seed in seeds]
 
 
-def controller_for(tables: RigTables, group: Group) -> ControllerConfig:
-    """The bench's `[controller]` with a group's law and trajectory. Raises BadConfig when there is no such law."""
-    content = tables.controller.model_dump() | {"law": group.law, "trajectory": group.trajectory}
+def controller_for(tables: RigTables, case: Case) -> ControllerConfig:
+    """The bench's `[controller]`, or the law's tuned one, with a run's law and trajectory. Raises BadConfig on an unknown law."""
+    base = tuned(case.law)[0] if case.tuned else tables.controller
+    content = base.model_dump() | {"law": case.law, "trajectory": case.trajectory}
     config = ControllerConfig.model_validate(content)
     if config.law == "pressure":
         raise BadConfig('law "pressure" follows a pressure: a campaign judges angles')
@@ -122,7 +127,7 @@ def case_tables(tables: RigTables, case: Case) -> tuple[RigTables, tuple[int, ..
 
     Raises BadFile or BadConfig.
     """
-    controller = controller_for(tables, case.group)
+    controller = controller_for(tables, case)
     loads = tables.plant.loads
     if case.payload:
         start_s, length_s = SETTLE_S + controller.approach_s, plan_of(controller).duration_s

@@ -230,3 +230,13 @@ def _wait_for_workers(pid, wanted=3, timeout_s=60.0):
 
 def test_the_shipped_bench_is_a_whole_rig():
     assert isinstance(rig_tables(load_bench(find_bench(Path("sim")))).controller, ControllerConfig)
+
+
+def test_tuned_gains_replace_the_benchs():
+    tables = rig_tables(load_bench(find_bench(Path("sim"))))
+    own, _ = case_tables(tables, Case("arc_eso", "t2", 3))
+    best, _ = case_tables(tables, Case("arc_eso", "t2", 3, tuned=True))
+    assert own.controller.law == best.controller.law == "arc_eso"
+    assert best.controller.trajectory == "t2"
+    assert own.controller.arc_eso != best.controller.arc_eso
+    assert best.controller.actuation.modes == "latched"
