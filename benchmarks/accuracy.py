@@ -8,7 +8,7 @@ Replayed currents control nothing: an error that was made once is carried along,
 pressure pushes the charge valve open. The last column says by how much a small error at 0.5 s of the trajectory has grown at its
 worst. The replay begins with the rig at rest, before the approach, and ends 60 s after the trajectory's start.
 
-    python benchmarks/accuracy.py [RUN ...] [--seconds 60]
+    python benchmarks/accuracy.py [RUN ...] [--closed-loop A:B] [--seconds 60]
 
 Without a RUN (a run's directory, or its log) it makes four at wall pace first: the ideal layer, and the rig layer's seeds 1 to 3.
 """
@@ -22,12 +22,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from logged_currents import Currents, apply, make_run, of_log
+from logged_currents import Currents, apply, make_run, of_closed_loop, of_log
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from scipy.integrate import solve_ivp
 
+from softloop.deploy.batch import seeds_of
 from softloop.dynamics.bending import bending_acceleration
 from softloop.dynamics.parameters import KV1_CHARGE, KV1_EXHAUST, KV6_CHARGE, KV6_EXHAUST, load_parameters, model_record, shipped
 from softloop.dynamics.pneumatics import pressure_rate
@@ -156,9 +157,8 @@ def growth(currents: Currents) -> float:
     return errors(replay(currents, 500_000, NUDGE_KPA), replay(currents, 500_000))[1] / NUDGE_KPA
 
 
-def judge(run: Path, seconds: float, table: Table) -> None:
-    """Add a run's rows."""
-    currents = of_log(open_log(find_log(run)), seconds)
+def judge(currents: Currents, table: Table) -> None:
+    """Add the rows of one run's currents."""
     ideal = currents.plant.layer == "ideal"
     name, limits = ("ideal", IDEAL_LIMITS) if ideal else (f"rig, seed {currents.plant.seed}", RIG_LIMITS)
     grown = growth(currents)
@@ -168,29 +168,34 @@ def judge(run: Path, seconds: float, table: Table) -> None:
     table.add_section()
 
 
-def measure(runs: list[Path], seconds: float, progress: Progress) -> Table:
-    """The table of all runs; without one, four are made first."""
+def measure(runs: list[Path], seeds: range, seconds: float, progress: Progress) -> Table:
+    """The table of all runs and of the closed loop's currents on rigs of `seeds`; without either, four runs are made first."""
     limits = f"ideal {IDEAL_LIMITS[0]:g} deg, {IDEAL_LIMITS[1]:g} kPa; rig {RIG_LIMITS[0]:g} deg, {RIG_LIMITS[1]:g} kPa"
     table = Table(title=f"T2, {seconds:g} s; limits: {limits}", title_justify="left")
     for head in ("layer", "step us", "|dy| deg", "|dP| kPa", "kept", "errors grow", "frames"):
         table.add_column(head, justify="left" if head == "layer" else "right")
     with tempfile.TemporaryDirectory(prefix="sl-accuracy-") as folder:
-        if not runs:
+        if not runs and not seeds:
             made = progress.track(RUNS, description="running T2 at wall pace")
             runs = [make_run(Path(folder), layer, seed) for layer, seed in made]
         for run in progress.track(runs, description="replaying"):
-            judge(run, seconds, table)
+            judge(of_log(open_log(find_log(run)), seconds), table)
+        for seed in progress.track(seeds, description="closed loop"):
+            currents = of_closed_loop("rig", seed)
+            judge(currents.until(currents.from_ns * 1e-9 + seconds), table)
     return table
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("runs", metavar="RUN", nargs="*", type=Path)
+    parser.add_argument("--closed-loop", metavar="A:B", help="and of the closed loop, rigs A to B - 1")
     parser.add_argument("--seconds", type=float, default=SECONDS)
     options = parser.parse_args()
     try:
+        seeds = seeds_of(options.closed_loop) if options.closed_loop else range(0)
         with Progress(console=Console(stderr=True), transient=True) as progress:
-            table = measure(options.runs, options.seconds, progress)
+            table = measure(options.runs, seeds, options.seconds, progress)
     except SoftloopError as error:
         sys.stderr.write(f"accuracy: {error}\n")
         sys.exit(error.exit_code)

@@ -101,9 +101,8 @@ class Tuned:
 
 
 def start_config(law: str) -> ControllerConfig:
-    """What is not tuned: laws with the observer keep a valve's turn, the others take modes from the demanded flow."""
-    actuation = {"modes": "latched", "bias_fraction": 0.9} if law in OBSERVED else {"modes": "flow"}
-    return ControllerConfig.model_validate({"law": law, "actuation": actuation})
+    """What is not tuned, and the same for all: a valve keeps its turn, and the one that waits is nearly open."""
+    return ControllerConfig.model_validate({"law": law, "actuation": {"modes": "latched", "bias_fraction": 0.9}})
 
 
 def with_gains(base: ControllerConfig, gains: dict[str, float]) -> ControllerConfig:
