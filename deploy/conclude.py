@@ -45,5 +45,5 @@ def judge(run: Path, *, report: bool, quiet: bool) -> None:
     console = Console()
     console.print(summary_table(summary))
     if page is not None:
-        pictures = ", ".join(sorted(p.name for p in page.parent.glob("*.svg")))
+        pictures = ", ".join(sorted(p.name for p in page.parent.glob("*.png")))
         console.print(f"report: {page}\npictures beside it, also as PDF: {pictures}", soft_wrap=True, highlight=False)

@@ -1,4 +1,4 @@
-"""The report of a run: its pictures and tables in one HTML page that needs nothing else; the pictures also as SVG and PDF."""
+"""The report of a run: pictures and tables in one HTML page that needs nothing else; the pictures also as files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from softloop.offline.figures import PICTURES
 from softloop.offline.log import Log, find_log, open_log
 from softloop.offline.page import document, picture, text
 from softloop.offline.summary import MEANINGS, shown, table_rows, write_summary
-from softloop.offline.vector import as_bytes, write
+from softloop.offline.vector import FORMATS, as_bytes, write
 
 REPORT = "report.html"
 
@@ -32,9 +32,10 @@ def make_report(run: Path | str, log: Log | None = None, summary: dict[str, Any]
     pictures = []
     for name, caption, draw in PICTURES:
         drawn = draw(log, summary)
-        pictures.append((caption, as_bytes(drawn, "svg")))
-        write(folder / f"{name}.svg", pictures[-1][1])
-        write(folder / f"{name}.pdf", as_bytes(drawn, "pdf"))
+        files = {ending: as_bytes(drawn, ending) for ending in FORMATS}
+        pictures.append((caption, files["svg"]))
+        for ending, data in files.items():
+            write(folder / f"{name}.{ending}", data)
     page = folder / REPORT
     write(page, page_of(log, summary, pictures).encode())
     return page
