@@ -49,7 +49,9 @@ class ValvesConfig(Table):
     path_delay_ms: float = Field(2.0, ge=0, le=1000, description="declared, adapters, Zenoh and controller, from sensor to gate")
     age_ticks: int = Field(3, ge=0, le=20, description="slack in the sensors' age budgets")
     command_wait_ms: float = Field(1.5, gt=0, le=5, description="a command later than this costs its tick")
-    driver_silence_ms: float = Field(20.0, ge=5, le=1000, description="without a good status frame for this long: a fault")
+    # Longer than the driver's own watchdog, which vents by itself when the gate is not heard: a silent driver is one whose
+    # currents are not seen, and a computer that stands still for 30 ms is not one.
+    driver_silence_ms: float = Field(50.0, ge=5, le=1000, description="without a good status frame for this long: a fault")
     driver_max_lost: int = Field(3, ge=1, le=13, description="so many status frames lost in a row make the next one refused")
 
     @model_validator(mode="after")
