@@ -16,18 +16,19 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from crude_tracking import Currents
+from logged_currents import Currents
 from plant_speed import loop as run_plant_alone
 from scipy_loop import scipy_loop
 
 from softloop.controller.records import LAWS as ALL_LAWS
 from softloop.deploy.batch import rig_tables
 from softloop.deploy.bench import find_bench, load_bench
-from softloop.offline.campaign import Case, Group, controller_for, plan_cases, run_cases
+from softloop.offline.campaign import Case, controller_for, plan_cases, run_cases
 from softloop.offline.closed_loop import SETTLE_S, RigTables, simulate_tables, simulate_trace
 from softloop.offline.pools import chunks, run_here, run_in_processes
 from softloop.offline.scores import run_scores
@@ -55,10 +56,7 @@ def best_cpu_s(work: Callable[[], Any], repeats: int = REPEATS) -> float:
 
 def tables_for(tables: RigTables, law: str, trajectory: str) -> RigTables:
     """The bench's tables with another law and trajectory."""
-    return RigTables(
-        controller_for(tables, Group(law, trajectory)), tables.plant, tables.valves, tables.pressures, tables.inclinometer,
-        tables.can, tables.pace,
-    )  # fmt: skip
+    return replace(tables, controller=controller_for(tables, Case(law, trajectory, tables.plant.seed)))
 
 
 def show_speed(tables: RigTables) -> None:
@@ -81,7 +79,8 @@ def plant_alone(tables: RigTables, seconds: float) -> tuple[float, float]:
     """CPU time of the rig alone under the currents of a run, s; and integration steps per second of rig time."""
     trace = simulate_trace(tables, make_schedule(SETTLE_S, seconds - SETTLE_S, 0.0))
     sent = trace.statuses[: len(trace.cycles)]
-    currents = Currents(sent["stamp_ns"] + 250_000, sent["charge_current_ma"].copy(), sent["exhaust_current_ma"].copy())
+    charge, exhaust = sent["charge_current_ma"].copy(), sent["exhaust_current_ma"].copy()
+    currents = Currents(sent["stamp_ns"] + 250_000, charge, exhaust, tables.plant, 0)
     params, events, steps = plant_record(tables.plant), np.zeros(64, EVENT), 0
 
     def work() -> None:

@@ -32,9 +32,8 @@ def main() -> None:
         run_s(Path(folder), 0.5)  # kernels compiled, files in memory
         short_s, long_s = run_s(Path(folder), SHORT_S), run_s(Path(folder), SHORT_S + options.seconds)
     took_s = long_s - short_s
-    print(
-        f"lockstep over all processes: {options.seconds:g} s of rig time in {took_s:.1f} s, {options.seconds / took_s:.2f} x real time"
-    )
+    speed = options.seconds / took_s
+    print(f"lockstep over all processes: {options.seconds:g} s of rig time in {took_s:.1f} s, {speed:.2f} x real time")
     print(f"starting, ending and judging a run: {short_s - SHORT_S * took_s / options.seconds:.1f} s")
 
 

@@ -48,7 +48,7 @@ def measure(layer: str, step_us: int, currents: Currents) -> tuple[float, float,
 def main() -> None:
     for layer in ("ideal", "rig"):
         currents = of_closed_loop(layer).until(SECONDS)
-        for step_us in (1000, 500, 250, 100):
+        for step_us in (1000, 500, 400, 250, 100):
             step_ns, steps, times = measure(layer, step_us, currents)
             print(f"{layer:5s}  step {step_us:4d} us  {step_ns:5.0f} ns per step  {steps:6.0f} steps/s  {times:6.0f} x real time")
 

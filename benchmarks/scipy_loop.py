@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from softloop.controller.command import fill_command
 from softloop.controller.tick import controller_tick
+from softloop.devices.gate_messages import give_command
 from softloop.offline.closed_loop import RigTables, link_record, ready_controller
-from softloop.offline.loop_kernels import hand_over, hear_driver, run_gate, take_inclinations, take_pressures
+from softloop.offline.loop_kernels import hear_driver, run_gate, take_inclinations, take_pressures
 from softloop.offline.loop_records import BETWEEN, INCLINATION, PRESSURE, no_records, push
 from softloop.plant.electrical import _happen, accept_command, next_event_ns
 from softloop.plant.mechanics import advance_memory
@@ -104,8 +106,11 @@ def scipy_loop(tables: RigTables, seconds: float, method: str = "RK45") -> np.nd
             built.scratch[0], built.first[0], cycle,
         )  # fmt: skip
         sent_ns = now_ns + link.latency_ns
-        hand_over(between, cycle, sent_ns)
+        fill_command(cycle, between.command)
+        give_command(between.given, between.command, sent_ns)
         run_gate(link, between, sent_ns, inputs.valves)
         output, end_ns = between.output, sent_ns + link.valve_frame_ns
-        accept_command(params, state, end_ns, output.charge_counts, output.exhaust_counts, output.output, between.frames % 65536)
+        accept_command(
+            params, state, end_ns, output.charge_counts, output.exhaust_counts, output.output, between.frame.seq & 0xFFFF
+        )
     return angle
