@@ -5,46 +5,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
-from typer.core import TyperGroup
 
-from softloop.wire.errors import EXIT_LOST, EXIT_OK, EXIT_USAGE, Interrupted, SoftloopError
-
-EXIT_CODES = """Exit codes: 0 all is well; 1 the command ran and its answer is no (a gate fault, a difference, a refused request);
-2 a bad argument or a bad file; 3 the machine (an address in use, a device or permission that is missing);
-4 a process or a wire was lost while running; 130 interrupted."""
-
-
-class Commands(TyperGroup):
-    """All commands; Ctrl-C in one is an error like others, so that it is said in one line."""
-
-    def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt:
-            raise Interrupted("interrupted") from None
-
-
-app = typer.Typer(
-    name="softloop",
-    cls=Commands,
-    help="Hardware-in-the-loop control of pneumatic soft bending actuators over Zenoh and CAN.",
-    epilog=EXIT_CODES,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 130},
-)
-
-log_app = typer.Typer(help="Look at a run's log, and mend it.", rich_markup_mode=None)
-app.add_typer(log_app, name="log")
-
-RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run directory, or a log in it.")]
-BenchArgument = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="A bench file, or the name of a shipped one (sim).")]
-OptionalBench = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="A bench file, or the name of a shipped one.")]
-RunDir = Annotated[Path, typer.Option(metavar="DIR", help="The run's directory.")]
+from softloop.deploy.cli_app import EXIT_CODES, BenchArgument, OptionalBench, RunArgument, RunDir, app, log_app
+from softloop.wire.errors import EXIT_LOST, EXIT_OK, EXIT_USAGE, SoftloopError
 
 
 @app.command(epilog=EXIT_CODES)
@@ -171,133 +137,6 @@ def same(
     return same_runs(first, second, as_json=as_json)
 
 
-@app.command(epilog=EXIT_CODES)
-def batch(
-    bench: BenchArgument,
-    seeds: Annotated[str, typer.Option(metavar="A:B", help="Rigs to draw: 0:1000 is a thousand of them, 7 is one.")],
-    jobs: Annotated[int, typer.Option(min=1, help="Processes that share the work.")] = 1,
-    law: Annotated[list[str] | None, typer.Option(help="Instead of the bench's; several with commas, or again.")] = None,
-    trajectory: Annotated[list[str] | None, typer.Option(help="Likewise: t1, t2, or the path of a CSV file.")] = None,
-    payload: Annotated[bool, typer.Option("--payload", help="Each run once more, with a payload that comes and leaves.")] = False,
-    tuned: Annotated[bool, typer.Option("--tuned", help="Each law with its shipped tuned gains, not the bench's.")] = False,
-    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Work on the Dask cluster of this scheduler.")] = None,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/<bench>-batch-<UTC time>.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
-) -> int:
-    """Run a bench on many simulated rigs, without its processes: every law and trajectory, as a table and a picture."""
-    from softloop.deploy.batch import Wanted
-    from softloop.deploy.batch import batch as run_batch
-
-    laws, trajectories = (tuple(name for text in given or () for name in text.split(",")) for given in (law, trajectory))
-    return run_batch(bench, Wanted(seeds, laws, trajectories, jobs, payload, tuned, scheduler, out, as_json))
-
-
-@app.command()
-def tune(
-    law: Annotated[str, typer.Argument(metavar="LAW", help="pid, pid_eso, smc, arc or arc_eso.")],
-    seeds: Annotated[str, typer.Option(metavar="A:B", help="Tuning rigs; judge on others.")] = "1000:1002",
-    added_ms: Annotated[float, typer.Option(metavar="MS", min=0.0, max=150.0, help="Latency added to the rig's own.")] = 0.0,
-    evaluations: Annotated[int, typer.Option(metavar="N", min=1, help="At least so many.")] = 500,
-    search_seed: Annotated[int, typer.Option(metavar="N", min=1, help="Of the optimiser.")] = 1,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the [controller] table here.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The outcome as JSON.")] = False,
-) -> int:
-    """Search a law's gains with CMA-ES in simulated runs; the same cost and budget for every law."""
-    from softloop.deploy.tune import run_tune
-
-    return run_tune(law, seeds, added_ms, evaluations, search_seed, out, as_json=as_json)
-
-
-@app.command()
-def evaluate(
-    seeds: Annotated[str, typer.Option(metavar="A:B", help="The rigs to judge on; not those of tuning.")] = "0:20",
-    laws: Annotated[str, typer.Option(metavar="LAW,LAW", help="Default: all.")] = "",
-    only: Annotated[str, typer.Option(metavar="CONDITION", help='One condition, such as "own latency"; default: all.')] = "",
-    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw Figs. 6 and 7 of all laws there.")] = None,
-    confirm: Annotated[int, typer.Option(metavar="N", min=0, help="Run the first N rigs at wall pace too, all processes.")] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="Everything as JSON, every rig.")] = False,
-) -> int:
-    """Judge every law with its tuned gains on many simulated rigs; exit code 1 where arc_eso misses a bar of its own."""
-    from softloop.deploy.evaluate import run_evaluate
-
-    return run_evaluate(seeds, laws, only, figures, confirm, as_json=as_json)
-
-
-@app.command()
-def identify(
-    runs: Annotated[list[Path] | None, typer.Argument(metavar="RUN...", help="Logs of excitation; the first one trains.")] = None,
-    csv: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="A CSV file; the first one trains, more validate.")
-    ] = None,
-    columns: Annotated[list[str] | None, typer.Option("--map", metavar="KEY=COLUMN", help="time, pressure and angle.")] = None,
-    orders: Annotated[str, typer.Option(metavar="m,n,r", help="Orders of a(y), b(y) and c(y).")] = "2,0,3",
-    hysteresis: Annotated[int, typer.Option(min=0, max=4, help="How many Bouc-Wen elements.")] = 0,
-    creep: Annotated[int, typer.Option(min=0, max=4, help="How many Prony terms.")] = 0,
-    delay: Annotated[bool, typer.Option("--delay", help="Estimate the angle's delay behind the pressure.")] = False,
-    lag: Annotated[bool, typer.Option("--lag", help="Estimate a first-order lag of the angle's sensor.")] = False,
-    at_rest: Annotated[
-        bool, typer.Option("--at-rest", help="Every file begins at rest; the zero of its angle is its own.")
-    ] = False,
-    method: Annotated[
-        Literal["oe", "iv", "ls"], typer.Option(help="Output error, instrumental variables, least squares.")
-    ] = "oe",
-    interval: Annotated[
-        Literal["coloured", "bootstrap", "white"], typer.Option(help="What the residuals are taken for.")
-    ] = "coloured",
-    output: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Write a parameter file with its evidence.")] = None,
-    select: Annotated[bool, typer.Option("--select", help="Compare orders instead.")] = False,
-    venting: Annotated[
-        bool, typer.Option("--venting", help="Fit the flow law of an emptying volume; map time, pressure and maybe input.")
-    ] = False,
-    train: Annotated[int, typer.Option(metavar="N", help="With --venting: the first N files train.")] = 1,
-    figure: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw measured and simulated angle.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
-) -> int:
-    """Identify the bending model from logs or CSV files, with intervals, and score it by free simulation."""
-    from softloop.deploy import identify as identification
-
-    if venting:
-        return identification.identify_vent(tuple(csv or ()), tuple(columns or ()), train, as_json=as_json)
-    asked = identification.Asked(
-        tuple(runs or ()), tuple(csv or ()), tuple(columns or ()), orders, hysteresis, creep, delay, lag, at_rest, method,
-        interval, select, output, figure, as_json,
-    )  # fmt: skip
-    return identification.identify(asked)
-
-
-@app.command()
-def valve(
-    csv: Annotated[Path, typer.Argument(metavar="FILE", help="Steady flow tests of one valve, a row each.")],
-    columns: Annotated[
-        list[str] | None,
-        typer.Option("--map", metavar="KEY=COLUMN", help="current (mA), upstream, downstream (kPa gauge), flow (kg/s)."),
-    ] = None,
-    discharge: Annotated[
-        float, typer.Option(metavar="C_f", min=0.01, max=1.0, help="Discharge coefficient; 1: areas hold it.")
-    ] = 1.0,
-    temperature: Annotated[float, typer.Option(metavar="K", min=200.0, max=400.0, help="Of the gas.")] = 293.15,
-    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
-) -> int:
-    """Identify a valve's model, Eqs. 12 and 16, from flow tests; what they do not show gets no number."""
-    from softloop.deploy.identify import identify_valve
-
-    return identify_valve(csv, tuple(columns or ()), discharge, temperature, as_json=as_json)
-
-
-@app.command()
-def coverage(
-    rigs: Annotated[int, typer.Option(min=1, help="How many rigs; on the rig layer each is excited 40 times.")] = 1000,
-    layer: Annotated[Literal["ideal", "rig"], typer.Option(help="Rigs that are the model, or that have more than it.")] = "ideal",
-    first_seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seeds are N, N+1, ...")] = 1,
-    output: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Write what was counted.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
-) -> int:
-    """Count over simulated rigs whether the intervals of each method hold what they say."""
-    from softloop.deploy.coverage import coverage as count
-
-    return count(layer, rigs, first_seed, output, as_json=as_json)
-
-
 @app.command()
 def plot(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory, or a log in it.")],
@@ -422,6 +261,10 @@ def prepare(bench: BenchArgument, run_dir: RunDir) -> int:
 
     prepare_as_child(load_bench(bench, run_dir), run_dir)
     return EXIT_OK
+
+
+# After these in the list of commands; each enters itself.
+import softloop.deploy.cli_campaigns  # noqa: E402, F401
 
 
 def main(arguments: list[str] | None = None) -> None:
