@@ -130,8 +130,10 @@ def test_a_stalled_gate_does_not_hold_longer():
 
 def test_a_silent_driver_is_a_fault_after_its_budget():
     bench = GateBench().armed()
-    outputs = [int(bench.tick(heard=False).gate) for _ in range(5)]
-    assert outputs == [g.GATE_ARMED] * 4 + [g.GATE_FAULT]
+    ticks = int(bench.config["driver_silence_ns"]) // PERIOD_NS
+    assert ticks == 10
+    outputs = [int(bench.tick(heard=False).gate) for _ in range(ticks + 1)]
+    assert outputs == [g.GATE_ARMED] * ticks + [g.GATE_FAULT]
     assert (bench.output.reason, bench.output.driver) == (g.REASON_DRIVER_SILENT, g.DRIVER_SILENT)
 
 
