@@ -35,7 +35,7 @@ def batch(
 @app.command()
 def tune(
     law: Annotated[str, typer.Argument(metavar="LAW", help="pid, pid_eso, smc, arc or arc_eso.")],
-    seeds: Annotated[str, typer.Option(metavar="A:B", help="Tuning rigs; judge on others.")] = "1000:1002",
+    seeds: Annotated[str, typer.Option(metavar="A:B", help="Tuning rigs; judge on others.")] = "1000:1008",
     added_ms: Annotated[float, typer.Option(metavar="MS", min=0.0, max=150.0, help="Latency added to the rig's own.")] = 0.0,
     evaluations: Annotated[int, typer.Option(metavar="N", min=1, help="At least so many.")] = 500,
     search_seed: Annotated[int, typer.Option(metavar="N", min=1, help="Of the optimiser.")] = 1,

@@ -5,7 +5,8 @@ geometric middle) and how far it looks at first (a quarter of it); it is no wall
 can lie on an edge. Gains that the bench file's schema refuses cost as much as a lost run.
 
 A trial's cost sums T1's maximum, its steady error, T2's maximum, the payload's peak and its recovery, each in units of its bar,
-and what the valves switch beyond 10 per second on dwells. Tuning rigs take turns: T1 with payload on the first, T2 on the next.
+and what the valves switch beyond 8 per second on dwells. Tuning rigs take turns: T1 with payload on the first, T2 on the next;
+the worst rig of each trajectory counts as much as the mean of all, or the search trades one bad rig for many good ones.
 Nothing of the plant's truth reaches the law; the cost, as an experimenter with a protractor would, looks at the true angle.
 """
 
@@ -29,6 +30,7 @@ Progress = Callable[[int, int, float], None]  # evaluations done, in all, best c
 
 BARS_DEG = {"t1": 1.0, "steady": 0.3, "t2": 1.0, "peak": 1.5}
 SWITCHES_PER_S = 10.0
+QUIET_PER_S = 8.0  # what tuning asks for: rigs that were not tuned on switch more
 LOST = 1e4
 STEP_US = 1000  # of the plant while tuning; evaluation takes the bench file's own
 
@@ -127,23 +129,23 @@ def cost_of(t1: Trial | None, t2: Trial | None) -> float:
     if t1 is not None:
         total += t1.max_deg / BARS_DEG["t1"] + t1.steady_deg / BARS_DEG["steady"]
         total += 0.5 * (t1.peak_deg + t1.left_peak_deg) / BARS_DEG["peak"] + 0.5 * (t1.recovery_s + t1.left_recovery_s)
-        total += OVER_QUIET * max(0.0, t1.switches_per_s / SWITCHES_PER_S - 1.0)
+        total += OVER_QUIET * max(0.0, t1.switches_per_s / QUIET_PER_S - 1.0)
     if t2 is not None:
         total += t2.max_deg / BARS_DEG["t2"]
     return total
 
 
 def cost(controller: ControllerConfig, latency: Latency, seeds: Sequence[int]) -> float:
-    """Mean cost over the tuning rigs, which take turns: T1 with payload, then T2."""
+    """Mean of the mean and the worst over the tuning rigs, which take turns: T1 with payload, then T2."""
     told = latency.controller(controller)
-    total = 0.0
+    costs: tuple[list[float], list[float]] = ([], [])
     for place, seed in enumerate(seeds):
         plant = latency.plant(PlantConfig(seed=seed, step_us=STEP_US))
         if place % 2 == 0:
-            total += cost_of(run_trial(told.model_copy(update={"trajectory": "t1"}), plant, payload=True), None)
+            costs[0].append(cost_of(run_trial(told.model_copy(update={"trajectory": "t1"}), plant, payload=True), None))
         else:
-            total += cost_of(None, run_trial(told.model_copy(update={"trajectory": "t2"}), plant))
-    return min(total / len(seeds), LOST)
+            costs[1].append(cost_of(None, run_trial(told.model_copy(update={"trajectory": "t2"}), plant)))
+    return min(sum(0.5 * (float(np.mean(c)) + max(c)) for c in costs if c), LOST)
 
 
 def tune(

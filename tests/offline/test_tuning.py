@@ -1,6 +1,7 @@
 """Tuning and evaluation: cost, search, the files they leave and read, and what a trial says."""
 
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,17 +10,37 @@ from softloop.controller.config import ControllerConfig
 from softloop.offline.closed_loop import simulate_run
 from softloop.offline.evaluation import CONDITIONS, OWN, Condition, figures, judge_law
 from softloop.offline.trials import PAYLOAD_ON_S, Trial, judge, lead_s, run_trial
-from softloop.offline.tuning import LOST, RANGES, Latency, as_toml, cost, cost_of, start_config, tune, with_gains
+from softloop.offline.tuning import (
+    LOST,
+    OVER_QUIET,
+    QUIET_PER_S,
+    RANGES,
+    Latency,
+    as_toml,
+    cost,
+    cost_of,
+    start_config,
+    tune,
+    with_gains,
+)
 from softloop.plant.config import LoadConfig, PlantConfig
 
-GOOD = Trial(max_deg=1.0, rms_deg=0.5, steady_deg=0.3, switches_per_s=10.0, effort_ma_s=0.0, peak_deg=1.5, left_peak_deg=1.5)
+GOOD = Trial(max_deg=1.0, rms_deg=0.5, steady_deg=0.3, switches_per_s=8.0, effort_ma_s=0.0, peak_deg=1.5, left_peak_deg=1.5)
 
 
 def test_every_bar_that_is_just_met_costs_one():
     assert cost_of(GOOD, None) == pytest.approx(3.5 - 0.5)  # T1, steady, and the two peaks at half weight
     assert cost_of(None, GOOD) == pytest.approx(1.0)
-    worse = Trial(max_deg=1.0, rms_deg=0.5, steady_deg=0.3, switches_per_s=20.0, effort_ma_s=0.0, peak_deg=1.5, left_peak_deg=1.5)
-    assert cost_of(worse, None) == pytest.approx(cost_of(GOOD, None) + 1.0)
+    restless = replace(GOOD, switches_per_s=2.0 * QUIET_PER_S)
+    assert cost_of(restless, None) == pytest.approx(cost_of(GOOD, None) + OVER_QUIET)
+
+
+def test_the_worst_rig_counts_as_much_as_the_mean_of_all():
+    controller = start_config("pid")
+    alone = [cost(controller, Latency(), [seed]) for seed in (1000, 1002)]
+    filler = cost(controller, Latency(), [1000, 1001]) - alone[0]  # T2 of the rig whose turn is the second
+    both = cost(controller, Latency(), [1000, 1001, 1002])
+    assert both == pytest.approx(0.5 * (sum(alone) / 2 + max(alone)) + filler)
 
 
 @pytest.mark.parametrize("law", RANGES)
