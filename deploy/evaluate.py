@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomlkit
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from softloop.deploy.bench import find_bench
+from softloop.deploy.confirm import confirm_runs, wall_table
 from softloop.deploy.tune import seeds_of
 from softloop.offline.closed_loop import simulate_run
 from softloop.offline.comparison_figures import save, side_by_side
@@ -121,8 +118,8 @@ def show(verdicts: Sequence[Verdict], latency: dict[str, float], confirmed: list
     bars = ", ".join(f"{name} {bar:g}" for name, bar in BARS_DEG.items())
     console.print(f"bars, deg: {bars}; back under 0.5 deg in {RECOVERY_S:g} s; {SWITCHES_PER_S:g} switches per second on dwells")
     console.print(f"the paper's ARC, deg: {paper}")
-    for run in confirmed:
-        console.print(f"wall pace: {run}")
+    if confirmed:
+        console.print(wall_table(confirmed))
 
 
 def _row(verdict: Verdict) -> list[str]:
@@ -143,28 +140,3 @@ def draw(laws: Sequence[str], seed: int, folder: Path) -> None:
             law: simulate_run(tuned(law)[0].model_copy(update={"trajectory": trajectory}), PlantConfig(seed=seed)) for law in laws
         }
         save(side_by_side(runs, f"{trajectory.upper()} on rig {seed}, every law with its tuned gains"), folder / name)
-
-
-def confirm_runs(laws: Sequence[str], seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """T1 and T2 of every law over the whole stack at wall pace: one `softloop run` each. Raises BadFile or BadConfig."""
-    jobs = [(law, seed, trajectory) for law in laws for seed in seeds for trajectory in ("t1", "t2")]
-    found = []
-    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
-        for law, seed, trajectory in bar.track(jobs, description="running at wall pace"):
-            found.append({"law": law, "seed": seed, "trajectory": trajectory, **_run_at_wall_pace(law, seed, trajectory)})
-    return found
-
-
-def _run_at_wall_pace(law: str, seed: int, trajectory: str) -> dict[str, Any]:
-    content = tomlkit.parse(find_bench(Path("sim")).read_text())
-    content["plant"]["seed"] = seed
-    content["controller"] = {**tuned(law)[0].model_dump(), "trajectory": trajectory}
-    with tempfile.TemporaryDirectory(prefix="softloop-") as folder:
-        bench, run_dir = Path(folder) / "bench.toml", Path(folder) / "run"
-        bench.write_text(tomlkit.dumps(content))
-        command = [sys.executable, "-m", "softloop.deploy.cli", "run", str(bench), "--run-dir", str(run_dir), "--no-report", "-q"]
-        code = subprocess.run(command, check=False).returncode
-        path = run_dir / "summary.json"
-        summary = json.loads(path.read_text()) if path.is_file() else {}
-    names = ("truth_error_max_deg", "truth_error_steady_deg", "evidence_valid")
-    return {"exit_code": code, **{name: summary.get(name) for name in names}}
