@@ -48,6 +48,9 @@ def errors(choice: str, delay_ms: float, rig: int, layer: Layer) -> dict[str, fl
     found: dict[str, float] = {}
     for trajectory in ("t1", "t2"):
         run = simulate_run(ControllerConfig(trajectory=trajectory, arc=arc, actuation=actuation, **budgets), plant)
+        if not run.completed:  # the gate broke it off
+            found |= {f"{trajectory}_max_deg": np.inf} | ({"t1_steady_deg": np.inf} if trajectory == "t1" else {})
+            continue
         on = run.cycles["trajectory_ns"] >= 0
         cycles, error = run.cycles[on], np.abs(run.truths["angle_deg"] - run.cycles["reference_deg"])[on]
         error = np.where(np.isfinite(error), error, np.inf)
@@ -71,9 +74,13 @@ def show(results: dict[str, dict[float, dict[str, float]]]) -> None:
         table.add_column(head, justify="left" if head == "choice" else "right")
     for choice, rows in results.items():
         for delay, found in rows.items():
-            table.add_row(choice, f"{delay:g}", *(f"{v:.2f}" for v in _ordered(found)), "yes" if within(found) else "no")
+            table.add_row(choice, f"{delay:g}", *(_cell(v) for v in _ordered(found)), "yes" if within(found) else "no")
         table.add_section()
     Console(width=100).print(table)
+
+
+def _cell(value: float) -> str:
+    return f"{value:.2f}" if np.isfinite(value) else "FAULT"
 
 
 def _ordered(found: dict[str, float]) -> list[float]:
