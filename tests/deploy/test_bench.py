@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from softloop.deploy.bench import _merge, find_bench, load_bench, process_config, read_source, shipped_benches
 from softloop.deploy.node import PROCESSES, find_process, processes_of
 from softloop.deploy.run_dir import keep_bench, make_run_dir
+from softloop.offline.evaluation import tuned
 from softloop.wire.errors import EXIT_USAGE, BadConfig, BadFile, Unavailable
 
 WHOLE = """
@@ -245,3 +246,9 @@ def test_loading_a_bench_imports_neither_numba_nor_scipy():
 def test_a_kept_bench_is_toml_that_others_can_read(tmp_path):
     kept = keep_bench(tmp_path, load_bench(shipped_benches()["sim"], tmp_path))
     assert tomllib.loads(kept.read_text())["controller"]["trajectory"] == "t1"
+
+
+def test_the_bench_of_our_own_law_has_the_gains_that_tuning_found():
+    told = load_bench(shipped_benches()["sim_eso"]).controller
+    found, _ = tuned("arc_eso")
+    assert told == found.model_copy(update={"trajectory": told.trajectory})

@@ -25,7 +25,7 @@ from softloop.offline.tuning import (
 )
 from softloop.plant.config import LoadConfig, PlantConfig
 
-GOOD = Trial(max_deg=1.0, rms_deg=0.5, steady_deg=0.3, switches_per_s=QUIET_PER_S, effort_ma_s=0.0, peak_deg=1.5, left_peak_deg=1.5)
+GOOD = Trial(1.0, 0.5, steady_deg=0.3, switches_per_s=QUIET_PER_S, effort_ma_s=0.0, peak_deg=1.5, left_peak_deg=1.5)
 
 
 def test_every_bar_that_is_just_met_costs_one():
