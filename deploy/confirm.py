@@ -20,7 +20,7 @@ from softloop.offline.evaluation import tuned
 from softloop.offline.trials import run_trial
 from softloop.plant.config import PlantConfig
 
-ATTEMPTS = 3  # a run in which the machine made the plant late says nothing of the law; it is counted and made again
+ATTEMPTS = 2  # a run in which the machine made the plant late says nothing of the law; it is counted and made again
 _KEYS = {
     "max_deg": "truth_error_max_deg",
     "steady_deg": "truth_error_steady_deg",
