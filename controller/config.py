@@ -112,7 +112,7 @@ class ControllerConfig(Table):
     trajectory_seed: int = Field(1, ge=0, le=2**32 - 1, description="phases of the multi-sines")
     approach_s: float = Field(4.0, gt=0, le=60, description="length of the smooth move to the first point")
     predict: bool = Field(True, description="carry the measured state on to the time at which the command acts")
-    actuation_delay_ms: float = Field(3.0, ge=0, le=100, description="declared, from tick to valve opening")
+    actuation_delay_ms: float = Field(3.0, ge=0, le=160, description="declared, from tick to valve opening")
     pressure_delay_ms: float = Field(1.5, ge=0, le=100, description="declared lag of the pressure sensor before its stamp")
     inclination_delay_ms: float = Field(1.0, ge=0, le=100, description="declared lag of the inclinometer before its stamp")
     pressure_budget_ms: float = Field(20.0, gt=0, description="an older pressure is not valid")

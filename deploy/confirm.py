@@ -27,11 +27,12 @@ _KEYS = {
     "valid": "evidence_valid",
     "problems": "evidence_problems",
     "gate_faults": "gate_faults",
+    "faults": "gate_fault_reasons",
 }
 
 
 def confirm_runs(laws: Sequence[str], seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """T1 and T2 of every law at wall pace, one `softloop run` each, until its evidence is valid or ATTEMPTS are made.
+    """T1 and T2 of every law at wall pace, one `softloop run` each, until one is whole and valid or ATTEMPTS are made.
 
     Each finished run is one line on stderr. Raises BadFile or BadConfig.
     """
@@ -52,9 +53,14 @@ def wall_table(confirmed: Sequence[dict[str, Any]]) -> Table:
         table.add_column(head, justify="left" if head in ("law", "evidence") else "right", no_wrap=True)
     for run in confirmed:
         figures = (_cell(run[name]) for name in ("max_deg", "steady_deg", "batch_max_deg", "batch_steady_deg"))
-        evidence = "valid" if run["valid"] else f"not valid: {run['problems']}"
-        table.add_row(run["law"], str(run["seed"]), run["trajectory"].upper(), *figures, str(run["attempts"]), evidence)
+        table.add_row(run["law"], str(run["seed"]), run["trajectory"].upper(), *figures, str(run["attempts"]), _evidence(run))
     return table
+
+
+def _evidence(run: dict[str, Any]) -> str:
+    if run["gate_faults"]:
+        return f"ended by the gate: {run['faults']}"
+    return "valid" if run["valid"] else f"not valid: {run['problems']}"
 
 
 def _cell(value: float | None) -> str:
@@ -67,7 +73,7 @@ def _confirmed(law: str, seed: int, trajectory: str) -> dict[str, Any]:
     run: dict[str, Any] = {}
     for attempt in range(1, ATTEMPTS + 1):
         run = _run_at_wall_pace(law, seed, trajectory) | {"attempts": attempt}
-        if run["valid"]:
+        if run["valid"] and not run["gate_faults"]:
             break
     steady = batch.steady_deg if trajectory == "t1" else None
     return {"law": law, "seed": seed, "trajectory": trajectory, **run, "batch_max_deg": batch.max_deg, "batch_steady_deg": steady}

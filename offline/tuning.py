@@ -83,13 +83,13 @@ class Latency:
         return base.model_copy(update={"command_delay_ms": half, "measurement_delay_ms": half})
 
     def controller(self, base: ControllerConfig) -> ControllerConfig:
-        return base.model_copy(
-            update={
-                "actuation_delay_ms": base.actuation_delay_ms + 0.5 * self.added_ms,
-                "pressure_budget_ms": base.pressure_budget_ms + self.added_ms,
-                "inclination_budget_ms": base.inclination_budget_ms + self.added_ms,
-            }
-        )
+        """Raises pydantic's ValidationError where the delay is more than a law can be told."""
+        told = {
+            "actuation_delay_ms": base.actuation_delay_ms + 0.5 * self.added_ms,
+            "pressure_budget_ms": base.pressure_budget_ms + self.added_ms,
+            "inclination_budget_ms": base.inclination_budget_ms + self.added_ms,
+        }
+        return ControllerConfig.model_validate(base.model_dump() | told)
 
 
 @dataclass
