@@ -12,8 +12,10 @@ import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait as wait_for
+from multiprocessing.forkserver import ensure_running
 from typing import Any
 
 from softloop.offline.campaign import Case, Result, run_case, run_cases
@@ -43,6 +45,8 @@ def run_in_processes(tables: RigTables, cases: Sequence[Case], jobs: int) -> Ite
     """In `jobs` processes. They come from a fork server that has loaded the kernels once. Raises Lost when one of them dies."""
     context = get_context("forkserver")
     context.set_forkserver_preload([__name__])
+    with _interrupts_ignored():  # inherited: Ctrl-C reaches the whole group, and the parent ends its workers
+        ensure_running()
     pool = ProcessPoolExecutor(jobs, context, initializer=_begin_worker)
     try:
         waiting, under_way = iter(chunks(cases)), set[Future[list[Result]]]()
@@ -66,8 +70,16 @@ def _hand_out(
     return bool(under_way)
 
 
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _begin_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its workers
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -116,7 +116,9 @@ def test_a_viewer_that_stalls_holds_nobody_up_and_comes_back_at_the_newest(stage
         viewer = Viewer(other).read(6.0)
         assert viewer.columns["time_s"][-1] > 5.0
         assert site.feed.history.head - before > 600
-        assert np.diff(viewer.columns["time_s"]).max() < 1.0
+        kept, got = site.feed.history.rows(0, site.feed.history.head)[:, 0], viewer.columns["time_s"]
+        start = int(np.argmin(np.abs(kept - got[0])))
+        np.testing.assert_allclose(got, kept[start : start + len(got)], atol=1e-3)  # the other one missed nothing
 
 
 class ShortFeed:
