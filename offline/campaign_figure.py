@@ -9,6 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from softloop.offline.campaign import PAPER, Group, Result
 from softloop.offline.figures import BLUE, GREEN, GREY, ORANGE, RED, SKY, STYLE, make_figure
@@ -39,6 +40,7 @@ def _panel(axis: Axes, trajectory: str, laws: list[str], results: list[Result]) 
         axis.axvline(PAPER[trajectory][0], color=GREY, linewidth=1.0, linestyle=(0, (5, 3)), label="paper's ARC")
     axis.set_xscale("log")
     axis.xaxis.set_major_formatter("{x:g}")
+    axis.xaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))  # every digit would not fit
     axis.xaxis.set_minor_formatter("{x:g}")
     axis.tick_params(axis="x", which="minor", labelsize=7)
     axis.set_ylim(0.0, 1.02)
