@@ -55,14 +55,21 @@ class Result:
 def run_with_faults(bench_file: Path, scenario_file: Path, options: Options) -> int:
     """Run a bench under a scenario, conclude as after any run, and say how the scenario ended; returns the exit code.
 
+    A bench without a simulated rig has no truth to judge by: then the code is that of the run.
+
     Raises BadFile, BadConfig, Unavailable.
     """
     file = find_scenario(scenario_file)
     scenario = load_scenario(file)
+    if options.pace is not None:
+        scenario = scenario.model_copy(update={"pace": options.pace})
 
     def then(bench: Bench, run_dir: Path, outcome: Outcome, *, quiet: bool) -> int:
         code = conclude(bench, run_dir, outcome.code, outcome.text, began=outcome.began, quiet=quiet)
         if code == EXIT_INTERRUPTED or not outcome.began:
+            return code
+        if bench.plant is None:
+            sys.stderr.write("softloop: no simulated rig, so no truth to judge the scenario by; see the events above\n")
             return code
         result = judged(scenario, bench, run_dir, outcome)
         if not quiet:

@@ -45,6 +45,8 @@ class Injector:
         since_s = (time.monotonic_ns() - self._armed_ns) / _S
         for injection in [i for i in self._waiting if i.at_s <= since_s]:
             self._waiting.remove(injection)
+            if self._alive(injection) is None:
+                continue
             self._standing.append(injection)
             self._say(injection, 1)
             self._begin(injection)
@@ -53,9 +55,14 @@ class Injector:
             self._end(injection)
             self._say(injection, 0)
 
-    def _begin(self, injection: InjectionConfig) -> None:
+    def _alive(self, injection: InjectionConfig) -> Child | None:
+        """The process that it is done to; None where that is not there (any more): then nothing is done, and nothing said."""
         child = self._children.all.get(injection.target)
-        if child is None or child.exit_code() is not None:
+        return None if child is None or child.exit_code() is not None else child
+
+    def _begin(self, injection: InjectionConfig) -> None:
+        child = self._alive(injection)
+        if child is None:
             return
         if injection.kind == "process_stop":
             child.popen.send_signal(signal.SIGSTOP)
@@ -68,8 +75,8 @@ class Injector:
                 self._start(injection.target)
 
     def _end(self, injection: InjectionConfig) -> None:
-        child = self._children.all.get(injection.target)
-        if child is None or child.exit_code() is not None:
+        child = self._alive(injection)
+        if child is None:
             return
         if injection.kind == "process_stop":
             child.popen.send_signal(signal.SIGCONT)

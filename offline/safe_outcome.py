@@ -2,7 +2,7 @@
 
 VENT: no current in the charge valve, the exhaust open, and the charge current stays away to the end of the log.
 DEAD: no current in either coil.
-CONTINUE: neither before the run's planned end, up to which the gate stayed armed; then it vented as after any run.
+CONTINUE: up to the run's planned end the gate stayed armed and the driver did as it was told; then it vented as after any run.
 NONE: none of these.
 """
 
@@ -24,7 +24,7 @@ EXHAUST_OPEN_MM2 = 0.05
 EMPTY_KPA = 5.0
 STEADY_NS = 100_000_000  # an exhaust that is open for less is one that is closing
 _KIND_GATE, _KIND_FAULT = constant("Event", "KIND_GATE"), constant("Event", "KIND_FAULT")
-_ARMED = constant("ValveStatus", "GATE_ARMED")
+_ARMED, _DRIVER_OK = constant("ValveStatus", "GATE_ARMED"), constant("ValveStatus", "DRIVER_OK")
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,19 @@ def outcome_of(log: Log, armed_s: float) -> SafeOutcome | None:
 
 
 def judge(truth: Records, began_ns: int, end_ns: int, *, stayed_armed: bool) -> SafeOutcome:
-    """The outcome from the records of `PlantTruth`, shape (n,), for an injection at `began_ns` and a planned end at `end_ns`."""
+    """The outcome from the records of `PlantTruth`, shape (n,), for an injection at `began_ns` and a planned end at `end_ns`.
+
+    A controller that lets air out shortly before the planned end looks like a vent; that the gate was armed (`stayed_armed`) and
+    the driver heard it says that it is none. A gate that is killed says nothing any more: then the driver's watchdog has come.
+    """
+    before_end = truth["driver"][truth["stamp_ns"] < end_ns]
+    if stayed_armed and len(before_end) and before_end[-1] == _DRIVER_OK:
+        return _timed(truth, CONTINUE, began_ns, end_ns, vented_from(truth, end_ns))
     vent_ns, dead_ns = vented_from(truth, began_ns), dead_from(truth, began_ns)
     if vent_ns is not None and vent_ns < end_ns:
         return _timed(truth, VENT, began_ns, began_ns, vent_ns)
     if dead_ns is not None and dead_ns < end_ns and vent_ns is None:
         return _timed(truth, DEAD, began_ns, began_ns, None)
-    if stayed_armed:
-        return _timed(truth, CONTINUE, began_ns, end_ns, vented_from(truth, end_ns))
     return _timed(truth, NONE, began_ns, began_ns, vent_ns)
 
 

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from softloop.offline.safe_outcome import judge
-from softloop.wire.messages import message
+from softloop.wire.messages import constant, message
 
 MS = 1_000_000
 S = 1000 * MS
 TRUTH = message("PlantTruth").dtype
+WATCHDOG = constant("ValveStatus", "DRIVER_WATCHDOG")
 N = 1000  # records, 5 ms apart
 
 
@@ -62,6 +63,19 @@ def test_a_run_that_went_on_is_timed_from_its_planned_end():
     assert found.seen == "CONTINUE"
     assert (found.vent_s, found.empty_s) == pytest.approx((0.05, 0.45))
     assert judge(vented(4.05), 2 * S, 4 * S, stayed_armed=False).seen == "NONE"
+
+
+def test_a_controller_that_lets_air_out_before_the_planned_end_has_not_stopped():
+    made = vented(3.7, closed_s=2.0)
+    found = judge(made, 2 * S, 4 * S, stayed_armed=True)
+    assert (found.seen, found.vent_s) == ("CONTINUE", pytest.approx(0.0))
+    assert judge(made, 2 * S, 4 * S, stayed_armed=False).seen == "VENT"
+
+
+def test_the_drivers_own_vent_counts_where_the_gate_said_nothing_more():
+    made = vented(2.1)
+    made["driver"][420:] = WATCHDOG
+    assert judge(made, 2 * S, 4 * S, stayed_armed=True).seen == "VENT"
 
 
 def test_current_in_the_charge_valve_to_the_end_is_none_of_these():
