@@ -31,8 +31,8 @@ class Result:
     """How a scenario ended.
 
     Attributes:
-        seen: VENT, DEAD, CONTINUE, NONE or NOTHING; see `offline.safe_outcome`.
-        chamber_kpa: chamber pressure when the first thing went wrong; of CONTINUE, at the planned end.
+        seen: VENT, DEAD, CONTINUE, TRAPPED, NONE or NOTHING; see `offline.safe_outcome`.
+        chamber_kpa: chamber pressure when the first thing went wrong; of CONTINUE and TRAPPED, at the planned end.
         vent_s, empty_s: from then to charge current 0 with the exhaust open, and to under 5 kPa; None: never.
         events: what was said in the run from the first injection on.
     """

@@ -67,7 +67,7 @@ class Scenario(Table):
     bench: str = Field("sim", description="a bench file beside this one, or the name of a shipped one")
     pace: Literal["wall", "lockstep"] = Field("wall", description="by the clock, or tick by tick and exact")
     duration_s: float = Field(gt=0, description="how long the rig is armed, unless a fault ends that")
-    expected: Literal["VENT", "DEAD", "CONTINUE"] = Field(description="CONTINUE: armed to the planned end, then vented")
+    expected: Literal["VENT", "DEAD", "CONTINUE", "TRAPPED"] = Field(description="what it must come to; see docs/faults.md")
     overrides: dict[str, Any] = Field(default_factory=dict, description="tables of the bench file, put over the bench's")
     injections: tuple[ScenarioInjection, ...] = Field(min_length=1, max_length=16, description="each an [[injections]]")
 

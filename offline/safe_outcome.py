@@ -3,6 +3,7 @@
 VENT: no current in the charge valve, the exhaust open, and the charge current stays away to the end of the log.
 DEAD: no current in either coil.
 CONTINUE: up to the run's planned end the gate stayed armed and the driver did as it was told; then it vented as after any run.
+TRAPPED: likewise, but after the planned end the exhaust did not open: pressure is held in, and software cannot let it out.
 NONE: none of these.
 """
 
@@ -18,7 +19,7 @@ from softloop.offline.log import Log
 from softloop.wire.messages import constant
 
 Records = NDArray[Any]
-VENT, DEAD, CONTINUE, NONE = "VENT", "DEAD", "CONTINUE", "NONE"
+VENT, DEAD, CONTINUE, TRAPPED, NONE = "VENT", "DEAD", "CONTINUE", "TRAPPED", "NONE"
 CHARGE_OFF_MA = 1.0
 EXHAUST_OPEN_MM2 = 0.05
 EMPTY_KPA = 5.0
@@ -32,9 +33,9 @@ class SafeOutcome:
     """What was seen.
 
     Attributes:
-        seen: VENT, DEAD, CONTINUE or NONE.
+        seen: VENT, DEAD, CONTINUE, TRAPPED or NONE.
         began_ns: rig clock of the first injection.
-        from_ns: rig clock that both times count from: the first injection; of CONTINUE, the planned end.
+        from_ns: rig clock that both times count from: the first injection; of CONTINUE and TRAPPED, the planned end.
         chamber_kpa: chamber pressure then.
         vent_s: until the charge current is 0 and the exhaust open; None when that never is.
         empty_s: until the chamber is under 5 kPa for good; None when it never is.
@@ -69,7 +70,8 @@ def judge(truth: Records, began_ns: int, end_ns: int, *, stayed_armed: bool) -> 
     """
     before_end = truth["driver"][truth["stamp_ns"] < end_ns]
     if stayed_armed and len(before_end) and before_end[-1] == _DRIVER_OK:
-        return _timed(truth, CONTINUE, began_ns, end_ns, vented_from(truth, end_ns))
+        vent_ns = vented_from(truth, end_ns)
+        return _timed(truth, TRAPPED if vent_ns is None else CONTINUE, began_ns, end_ns, vent_ns)
     vent_ns, dead_ns = vented_from(truth, began_ns), dead_from(truth, began_ns)
     if vent_ns is not None and vent_ns < end_ns:
         return _timed(truth, VENT, began_ns, began_ns, vent_ns)

@@ -45,7 +45,7 @@ class LoadConfig(Table):
 
 
 class FaultConfig(Table):
-    """Something that breaks, and perhaps is whole again. Times count from the plant's start."""
+    """Something that breaks, and perhaps is whole again. Times count from what `faults_from` says."""
 
     kind: Literal[
         "chamber_bias", "chamber_stuck", "analog_silent", "angle_bias", "rate_bias", "angle_stuck", "inclinometer_silent",

@@ -15,7 +15,7 @@ from softloop.wire.benchfile import Table
 ALWAYS_S = 1e9
 LINE_ACTIONS = ("drop", "delay", "duplicate", "reorder", "corrupt")
 # Kinds whose size means something, and what. All others have none; `corrupt` may have one.
-SIZED = {"delay": "ms", "bias": "kPa, deg or deg/s", "noise": "its standard deviation"}
+SIZED = {"delay": "ms", "step": "ms", "bias": "kPa, deg or deg/s", "noise": "its standard deviation"}
 # Target -> the process that injects.
 CAN_TARGETS = {"analog": "pressures", "driver": "valves", "command": "valves"}
 SERIAL_TARGETS = {"inclinometer": "inclinometer"}
@@ -31,6 +31,7 @@ TARGETS: dict[str, dict[str, str]] = {
     "zenoh": ZENOH_TARGETS,
     "sensor": SENSOR_TARGETS,
     "process": dict.fromkeys(PROCESSES, LAUNCHER),
+    "clock": {name: name for name in ("valves", "pressures", "inclinometer", "controller")},
     "disk": {"recorder": LAUNCHER},
 }
 
@@ -39,7 +40,7 @@ Kind = Literal[
     "serial_drop", "serial_delay", "serial_duplicate", "serial_reorder", "serial_corrupt",
     "zenoh_drop", "zenoh_delay", "zenoh_duplicate", "zenoh_reorder", "zenoh_corrupt",
     "sensor_stuck", "sensor_bias", "sensor_noise", "sensor_nan",
-    "process_kill", "process_stop", "process_restart", "disk_full",
+    "process_kill", "process_stop", "process_restart", "clock_step", "disk_full",
 ]  # fmt: skip
 
 
@@ -51,11 +52,11 @@ class InjectionConfig(Table):
     at_s: float = Field(ge=0, description="when it begins")
     duration_s: float = Field(ALWAYS_S, gt=0, description="default: it stays")
     probability: float = Field(1.0, gt=0, le=1, description="how likely each frame, byte, sample or value is hit")
-    size: float = Field(0.0, description="delay: ms; bias: kPa, deg, deg/s; noise: standard deviation; corrupt: bits, 0 is one")
+    size: float = Field(0.0, description="delay, step: ms; bias: kPa, deg, deg/s; noise: its deviation; corrupt: bits, 0 is one")
 
     @property
     def family(self) -> str:
-        """What it is done to: can, serial, zenoh, sensor, process, disk."""
+        """What it is done to: can, serial, zenoh, sensor, process, clock, disk."""
         return self.kind.partition("_")[0]
 
     @property
@@ -68,6 +69,16 @@ class InjectionConfig(Table):
         """The process that does it."""
         return TARGETS[self.family][self.target]
 
+    @property
+    def has_chance(self) -> bool:
+        """It hits things one by one, each with its probability."""
+        return self.family in ("can", "serial", "zenoh", "sensor")
+
+    @property
+    def needs_wall(self) -> bool:
+        """It is done to a process or to its clock, which at lockstep pace wait for each other."""
+        return self.process == LAUNCHER or self.family == "clock"
+
     @model_validator(mode="after")
     def _makes_sense(self) -> InjectionConfig:
         allowed = TARGETS[self.family]
@@ -79,9 +90,9 @@ class InjectionConfig(Table):
         if (self.action in SIZED) != (self.size != 0.0) and self.action != "corrupt":
             needs = f"needs a size ({SIZED[self.action]})" if self.action in SIZED else "has no size"
             raise ValueError(f"kind '{self.kind}' {needs}")
-        if self.size < 0 and self.action != "bias":
+        if self.size < 0 and self.action not in ("bias", "step"):
             raise ValueError(f"size of '{self.kind}' must be above 0, got {self.size:g}")
-        if self.probability != 1.0 and self.process == LAUNCHER:
+        if self.probability != 1.0 and not self.has_chance:
             raise ValueError(f"kind '{self.kind}' has no probability")
         return self
 

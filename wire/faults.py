@@ -10,11 +10,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from random import Random
+from threading import Lock
 from typing import TYPE_CHECKING, Protocol
 
 from softloop.wire.can_errors import ErrorCounters, NodeState, bus_error_frame, state_frame
 from softloop.wire.can_frame import CanFrame
 from softloop.wire.channels import VALVES, Channel
+from softloop.wire.clock import Clock
 from softloop.wire.fault_config import FaultsConfig
 from softloop.wire.fault_line import Line, Strike, flip_bits
 from softloop.wire.messages import CDR_HEADER, BadPayload, constant, message, names_of
@@ -37,6 +39,7 @@ _FIELDS = {
     "rate": ("inclination", "rate_deg_s"),
 }
 _MANY = 256
+_MS = 1_000_000
 
 
 class FrameSink(Protocol):
@@ -117,6 +120,28 @@ def install(config: FaultsConfig, context: Context, source: int, armed_ns: Calla
     if config.of_process(context.process):
         faults = Faults(config, context, source, armed_ns)
         context.faults, context.wire.spoil = faults, faults.spoil
+        steps = faults.of("clock", context.process)
+        if steps:
+            context.pace.clock = SteppedClock(context.clock, steps)
+
+
+class SteppedClock:
+    """A clock that jumps, and jumps back when that is over. For wall pace; asked by any thread."""
+
+    def __init__(self, clock: Clock, strikes: list[Strike]) -> None:
+        self._clock, self._strikes, self._lock = clock, strikes, Lock()
+
+    def _ahead_ns(self, now_ns: int) -> int:
+        with self._lock:
+            return sum(round(s.config.size * _MS) for s in self._strikes if s.on(now_ns))
+
+    def now_ns(self) -> int:
+        now_ns = self._clock.now_ns()
+        return now_ns + self._ahead_ns(now_ns)
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Until its own time is `deadline_ns`, as it goes at the start of the sleep."""
+        self._clock.sleep_until_ns(deadline_ns - self._ahead_ns(self._clock.now_ns()))
 
 
 def when_armed(wire: Wire) -> Callable[[], int | None]:

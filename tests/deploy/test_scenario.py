@@ -67,7 +67,7 @@ def test_by_the_clock_faults_of_the_rig_count_from_arming(bench):
 @pytest.mark.parametrize(("old", "new", "said"), [
     ('name = "one"', 'name = "one"\nnames = 1', "unknown key 'names'; allowed here: bench, description, duration_s, expected,"),
     ("at_s = 2.0", "at_s = 2.0\nat = 1.0", "unknown key 'injections.0.at'; allowed here: at_s, duration_s, kind,"),
-    ('expected = "VENT"', 'expected = "vent"', "'VENT', 'DEAD' or 'CONTINUE'"),
+    ('expected = "VENT"', 'expected = "vent"', "'VENT', 'DEAD', 'CONTINUE' or 'TRAPPED'"),
     ('kind = "power_loss"', 'kind = "gremlins"', "no kind 'gremlins'; there are: chamber_bias, "),
     ("at_s = 2.0", "at_s = -2.0", "key 'injections.0.at_s'"),
     ('target = "inclinometer"', 'target = "plant"', "no target 'plant'; it has: inclinometer"),
@@ -77,6 +77,8 @@ def test_by_the_clock_faults_of_the_rig_count_from_arming(bench):
     ("duration_s = 3.0", "", "key 'duration_s' is missing"),
     ("settle_s = 0.4", "settle = 0.4", "unknown key 'run.settle'"),
     ('kind = "power_loss"', 'kind = "process_kill"\ntarget = "valves"', "kind 'process_kill' needs wall pace"),
+    ('kind = "power_loss"', 'kind = "clock_step"\ntarget = "valves"\nsize = 5.0', "kind 'clock_step' needs wall pace"),
+    ('kind = "power_loss"', 'kind = "disk_full"\ntarget = "recorder"\nprobability = 0.5', "kind 'disk_full' has no probability"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line_that_names_file_and_key(bench, tmp_path, old, new, said):
     assert GOOD.count(old) == 1

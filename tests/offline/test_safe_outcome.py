@@ -72,6 +72,13 @@ def test_a_controller_that_lets_air_out_before_the_planned_end_has_not_stopped()
     assert judge(made, 2 * S, 4 * S, stayed_armed=False).seen == "VENT"
 
 
+def test_an_exhaust_that_does_not_open_after_the_planned_end_holds_the_pressure_in():
+    made = vented(4.05)
+    made["exhaust_area_mm2"] = 0.0
+    found = judge(made, 2 * S, 4 * S, stayed_armed=True)
+    assert (found.seen, found.vent_s) == ("TRAPPED", None)
+
+
 def test_the_drivers_own_vent_counts_where_the_gate_said_nothing_more():
     made = vented(2.1)
     made["driver"][420:] = WATCHDOG

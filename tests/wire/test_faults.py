@@ -10,7 +10,7 @@ from softloop.wire.can_frame import ERROR_BUS_OFF, ERROR_CONTROLLER, ERROR_RESTA
 from softloop.wire.channels import INCLINATION, PRESSURE
 from softloop.wire.fault_config import InjectionConfig
 from softloop.wire.fault_line import Strike
-from softloop.wire.faults import FaultyBytes, FaultyFrames, FaultySender, spoiled_put
+from softloop.wire.faults import FaultyBytes, FaultyFrames, FaultySender, SteppedClock, spoiled_put
 from softloop.wire.messages import message
 
 MS = 1_000_000
@@ -175,3 +175,28 @@ def test_a_spoiled_sample_is_still_of_its_size():
     out = samples(PRESSURE, [strike("zenoh_corrupt", "pressure", size=3.0)], chamber_pressure_kpa=1.0)
     sound = samples(PRESSURE, [], chamber_pressure_kpa=1.0)
     assert [SAMPLE.pack(a) != SAMPLE.pack(b) for a, b in zip(out, sound, strict=True)] == [False] * 9 + [True] * 10 + [False] * 11
+
+
+class Machine:
+    """A clock that goes on while it is slept on."""
+
+    def __init__(self):
+        self.now = 0
+
+    def now_ns(self):
+        return self.now
+
+    def sleep_until_ns(self, deadline_ns):
+        self.now = max(self.now, deadline_ns)
+
+
+@pytest.mark.parametrize("size", [30.0, -30.0])
+def test_a_clock_jumps_sleeps_as_long_as_before_and_jumps_back(size):
+    machine = Machine()
+    clock = SteppedClock(machine, [strike("clock_step", "controller", size=size)])
+    ahead = []
+    for _ in range(30):
+        clock.sleep_until_ns(clock.now_ns() + 5 * MS)
+        ahead.append(clock.now_ns() - machine.now)
+    assert machine.now == 150 * MS
+    assert ahead == [0] * 9 + [round(size * MS)] * 10 + [0] * 11
