@@ -176,24 +176,23 @@ def _say(results: list[Result], *, as_json: bool) -> None:
 
 
 def _print_table(results: list[Result]) -> None:
-    from rich.console import Console  # noqa: PLC0415
-    from rich.table import Table  # noqa: PLC0415
-
-    table = Table("scenario", "expected", "seen", "from kPa", "vent ms", "< 5 kPa ms", "events")
+    """A line for each scenario, and what was said in it below."""
+    print(_line("scenario", "expected", "seen", "from kPa", "vent ms", "< 5 kPa ms"))
     for result in results:
-        style = None if result.good else "red"
-        table.add_row(
-            result.scenario, result.expected, result.seen, _number(result.chamber_kpa), _number(result.vent_s, 1000, 0),
-            _number(result.empty_s, 1000, 0), _shown(result.events), style=style,
-        )  # fmt: skip
-    Console().print(table)
+        times = (_number(result.vent_s, 1000, 0), _number(result.empty_s, 1000, 0))
+        print(_line(result.scenario, result.expected, result.seen, _number(result.chamber_kpa), *times))
+        print("".join(f"    {event}\n" for event in _shown(result.events)), end="")
+
+
+def _line(scenario: str, expected: str, seen: str, *numbers: str) -> str:
+    return f"{scenario:28} {expected:8} {seen:8}" + "".join(f" {number:>10}" for number in numbers)
 
 
 def _number(value: float | None, times: float = 1.0, places: int = 1) -> str:
     return "-" if value is None else f"{times * value:.{places}f}"
 
 
-def _shown(events: list[str]) -> str:
-    """The first events, one a line."""
+def _shown(events: list[str]) -> list[str]:
+    """The first events."""
     more = [f"and {len(events) - _SHOWN} more"] if len(events) > _SHOWN else []
-    return "\n".join(events[:_SHOWN] + more)
+    return events[:_SHOWN] + more
