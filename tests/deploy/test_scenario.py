@@ -1,5 +1,6 @@
 """Scenario files: what is refused and how it is said, and the bench that one makes."""
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -147,3 +148,17 @@ def test_no_text_is_more_than_one_line(tmp_path_factory, text):
     path = tmp_path_factory.getbasetemp() / "fuzzed.toml"
     path.write_bytes((GOOD[: len(GOOD) // 2] + text).encode("utf-8", "replace"))
     assert lines_said(load_scenario, path) == 1
+
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "faults.md"
+
+
+def test_the_page_names_every_kind_on_the_hosts_side_and_every_shipped_scenario():
+    words = set(re.findall(r"[a-z0-9_]+", PAGE.read_text()))
+    assert set(HOST_KINDS) - words == set()
+    assert set(shipped_scenarios()) - words == set()
+
+
+def test_the_pages_example_is_good(bench):
+    made = bench(re.search(r"^```toml\n(.*?)^```", PAGE.read_text(), re.S | re.M)[1])
+    assert [i.kind for i in made.faults.injections] == ["serial_drop", "process_kill"]
