@@ -26,6 +26,7 @@ from softloop.wire.benchfile import Table, load_model, read_toml, validated
 from softloop.wire.can_config import CanConfig
 from softloop.wire.config import HostConfig, PaceConfig, ZenohConfig
 from softloop.wire.errors import BadConfig, BadFile
+from softloop.wire.fault_config import FaultsConfig
 
 NAME = r"^[a-z0-9_-]{1,24}$"
 MAX_BASES = 8
@@ -53,6 +54,7 @@ class Bench(Table):
     recorder: RecorderConfig | None = None
     page: PageConfig = PageConfig()
     foxglove: FoxgloveConfig = FoxgloveConfig()
+    faults: FaultsConfig = FaultsConfig()
 
 
 @dataclass(frozen=True)
@@ -163,6 +165,11 @@ def _check_lockstep(bench: Bench, source: Source) -> None:
             f"{source.file}: key 'pace.mode': lockstep needs the tables [plant], [valves] and [controller]: "
             "real devices do not wait for a tick"
         )
+    if bench.plant.faults_from != "start":
+        raise BadConfig(f"{source.file}: key 'plant.faults_from': must be \"start\" at lockstep pace, where arming is planned")
+    late = next((i.kind for i in bench.faults.injections if i.needs_wall), None)
+    if late is not None:
+        raise BadConfig(f"{source.file}: key 'faults.injections': kind '{late}' needs wall pace")
     if bench.inclinometer is not None and bench.inclinometer.configure:
         raise BadConfig(f"{source.file}: key 'inclinometer.configure': must be false at lockstep pace")
 

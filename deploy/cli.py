@@ -26,6 +26,10 @@ def run(
         Literal["wall", "lockstep"] | None,
         typer.Option(help="Instead of the bench file's: by the clock, or tick by tick."),
     ] = None,
+    faults: Annotated[
+        Path | None,
+        typer.Option(metavar="SCENARIO.toml", help="Let things go wrong, and judge how that ends; see `softloop faults`."),
+    ] = None,
 ) -> int:
     """Run a bench: start its processes, arm, watch, vent, stop, summary and report."""
     from softloop.deploy.bench import find_bench
@@ -34,6 +38,10 @@ def run(
     options = Options(
         run_dir=run_dir, duration_s=duration, report=False if no_report else None, quiet=quiet, pace=pace, page=page
     )
+    if faults is not None:
+        from softloop.deploy.faults import run_with_faults
+
+        return run_with_faults(find_bench(bench), faults, options)
     return launch(find_bench(bench), options)
 
 

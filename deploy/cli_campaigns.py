@@ -33,6 +33,18 @@ def batch(
 
 
 @app.command()
+def faults(
+    only: Annotated[list[Path] | None, typer.Argument(metavar="SCENARIO...", help="Files, or names of shipped ones.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/faults-<UTC time>.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON; it also goes to DIR/faults.json.")] = False,
+) -> int:
+    """Run all shipped fault scenarios (or the ones named), and say how each ended; exit code 1 where one is not as expected."""
+    from softloop.deploy.faults import run_all
+
+    return run_all(only or [], out, as_json=as_json)
+
+
+@app.command()
 def tune(
     law: Annotated[str, typer.Argument(metavar="LAW", help="pid, pid_eso, smc, arc or arc_eso.")],
     seeds: Annotated[str, typer.Option(metavar="A:B", help="Tuning rigs; judge on others.")] = "1000:1008",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +16,7 @@ from softloop.deploy.beside import beside
 from softloop.deploy.children import Child, Children
 from softloop.deploy.conclude import conclude
 from softloop.deploy.gate_requests import Requests, ask
+from softloop.deploy.injector import Injector
 from softloop.deploy.live import View, make_view
 from softloop.deploy.node import STOP_ORDER, processes_of
 from softloop.deploy.prepare import prepare_in_child
@@ -58,8 +59,12 @@ class Options:
     foxglove: bool = False
 
 
-def launch(bench_file: Path, options: Options) -> int:
-    """Run a bench from start to end; returns the exit code.
+def _conclude(bench: Bench, run_dir: Path, outcome: Outcome, *, quiet: bool) -> int:
+    return conclude(bench, run_dir, outcome.code, outcome.text, began=outcome.began, quiet=quiet)
+
+
+def launch(bench_file: Path, options: Options, then: Callable[..., int] = _conclude) -> int:
+    """Run a bench from start to end; returns the exit code, which `then` gives once all its processes have ended.
 
     Raises:
         BadFile, BadConfig: the bench file is wrong, or its trajectory not feasible.
@@ -81,7 +86,7 @@ def launch(bench_file: Path, options: Options) -> int:
         ):
             kind = Launch if bench.pace.mode == "wall" else LockstepLaunch
             outcome = kind(bench, run_dir, wire, view, stop, Children(), prepared.trajectory_s).run()
-        return conclude(bench, run_dir, outcome.code, outcome.text, began=outcome.began, quiet=options.quiet)
+        return then(bench, run_dir, outcome, quiet=options.quiet)
 
 
 def onlookers(run_dir: Path, options: Options) -> list[list[str]]:
@@ -135,6 +140,7 @@ class Launch:
         self.children = children
         self.words: dict[str, str] = {}
         self.all_alive = False
+        self.injector = Injector(bench, run_dir, wire, children, self.start_process)
 
     def run(self) -> Outcome:
         """Start, arm, watch; then vent and stop, whatever happened."""
@@ -154,9 +160,13 @@ class Launch:
 
     def _start(self) -> None:
         for process in processes_of(self.bench):
-            arguments = ["node", process.name, str(self.run_dir / BENCH_FILE), "--run-dir", str(self.run_dir)]
-            self.children.start(process.name, arguments, self.run_dir / f"{process.name}.log")
+            self.start_process(process.name)
             self.words[process.name] = "starting"
+
+    def start_process(self, name: str) -> None:
+        """Start a process of the bench, or start it anew."""
+        arguments = ["node", name, str(self.run_dir / BENCH_FILE), "--run-dir", str(self.run_dir)]
+        self.children.start(name, arguments, self.run_dir / f"{name}.log")
 
     def _wait_alive(self) -> Outcome | None:
         deadline = time.monotonic() + self.bench.run.ready_timeout_s
@@ -252,6 +262,7 @@ class Launch:
     def _refresh(self, stage: str) -> None:
         for line in self.state.refresh():
             self.view.say(line)
+        self.injector.act(self.state)
         self._show(stage)
 
     def _show(self, stage: str) -> None:

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from softloop.deploy.bench import PROCESS_NAMES, Bench, load_bench, process_config
 from softloop.wire.errors import BadConfig
+from softloop.wire.messages import constant
 from softloop.wire.pace import Pace
+from softloop.wire.schedule import make_schedule
 from softloop.wire.session import Wire
 from softloop.wire.shell import Context, Stop, run_process
 
@@ -67,6 +69,7 @@ def run_node(name: str, bench_file: Path, run_dir: Path, lifeline_fd: int | None
     process = find_process(bench, name)
 
     def body(context: Context) -> None:
+        _inject(bench, process, context)
         import_module(process.module).run(process_config(bench, name), context)
 
     return run_process(
@@ -80,6 +83,21 @@ def run_node(name: str, bench_file: Path, run_dir: Path, lifeline_fd: int | None
         realtime=process.realtime,
         pace_of=lambda wire, stop: make_pace(bench, name, wire, stop),
     )
+
+
+def _inject(bench: Bench, process: Process, context: Context) -> None:
+    """Let the process hear and say what `[faults]` makes of it."""
+    if not bench.faults.of_process(process.name):
+        return
+    from softloop.wire.faults import install, when_armed  # noqa: PLC0415 - no sound rig needs it
+
+    armed_ns = when_armed(context.wire) if bench.pace.mode == "wall" else lambda: planned_arming_ns(bench)
+    install(bench.faults, context, constant("Event", process.source), armed_ns)
+
+
+def planned_arming_ns(bench: Bench) -> int:
+    """Rig clock at which the gate is asked to arm at lockstep pace."""
+    return make_schedule(bench.run.settle_s, 0.0, 0.0).arm_ns
 
 
 def make_pace(bench: Bench, name: str, wire: Wire, stop: Stop) -> Pace:

@@ -65,7 +65,7 @@ class InclinometerLoop:
         self.put = context.wire.publisher(INCLINATION)
         self.status, self.events = StatusReporter(context, _SOURCE), EventReporter(context, _SOURCE)
         self.rate = RateWatch(config)
-        self.bytes = context.pace.bytes(self, WIRE_INCLINOMETER)
+        self.bytes = context.bytes(self, WIRE_INCLINOMETER)
 
     def turn(self) -> None:
         """Wait for bytes, publish what they bring, keep time. Raises Unavailable on a wrong rate from the start."""

@@ -32,7 +32,7 @@ def run(config: PressuresProcess, context: Context) -> None:
     port = open_port(config.bus, config.pressures.can, context.wire, context.clock, [can_frames.ANALOG_INPUTS_ID])
     try:
         loop = PressuresLoop(config, context, port)
-        frames = context.pace.frames(port, WIRE_ANALOG)
+        frames = context.frames(port, WIRE_ANALOG)
         context.enter_loop()
         while not context.stop:
             frame = frames.recv(_WAIT_S)

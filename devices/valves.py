@@ -74,7 +74,8 @@ class ValvesLoop:
         self._warm()
         self.commands = context.pace.commands(context.wire.inbox(COMMAND))
         self.requests = context.pace.requests(context.wire.inbox(REQUEST))
-        self.driver_frames = context.pace.frames(port, WIRE_DRIVER)
+        self.driver_frames = context.frames(port, WIRE_DRIVER)
+        self.sender = context.faults.sender(port)
         self.put = context.wire.publisher(VALVES)
         self.status, self.events = StatusReporter(context, _SOURCE), EventReporter(context, _SOURCE)
         self.began_ns = self.clock.now_ns()
@@ -179,7 +180,7 @@ class ValvesLoop:
             raise self.lost
 
     def _send(self, data: bytes, stamp_ns: int) -> None:
-        if self.port.send(can_frames.VALVE_COMMAND_ID, data, stamp_ns):
+        if self.sender.send(can_frames.VALVE_COMMAND_ID, data, stamp_ns):
             self.context.pace.note_sent(stamp_ns)
         else:
             self.status.dropped += 1

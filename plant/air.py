@@ -46,6 +46,7 @@ def static_air_slopes(air: Any, state: Any, charge_ma: float, exhaust_ma: float)
     supply_pa, chamber_pa = PA_PER_KPA * supply_kpa, PA_PER_KPA * chamber
     area_in = orifice_area(air.charge, air.k_v1_charge, air.k_v6_charge, charge_ma, supply_pa, chamber_pa)
     area_out = orifice_area(air.exhaust, air.k_v1_exhaust, air.k_v6_exhaust, exhaust_ma, chamber_pa, 0.0)
+    area_in = max(area_in, 0.0) + state.broken.charge_leak_m2
     into, out = valve_flows(air, supply_kpa, chamber, area_in, area_out + state.broken.burst_m2)
     state.slope[CHAMBER] = GAS_CONSTANT * air.wall_k / (PA_PER_KPA * air.volume_m3) * (into - out)
 
@@ -91,7 +92,8 @@ def rig_air_slopes(air: Any, state: Any, charge_ma: float, exhaust_ma: float) ->
     x, slope = state.stage, state.slope
     supply, block = x[SUPPLY], x[TUBE]
     open_out = max(min(x[AREA_OUT], air.exhaust.area_max_m2), 0.0) + state.broken.burst_m2
-    into, out = valve_flows(air, supply, block, min(x[AREA_IN], air.charge.area_max_m2), open_out)
+    open_in = max(min(x[AREA_IN], air.charge.area_max_m2), 0.0) + state.broken.charge_leak_m2
+    into, out = valve_flows(air, supply, block, open_in, open_out)
     block_pa = PA_PER_KPA * block + ATMOSPHERE_PA
     chamber_pa = PA_PER_KPA * x[CHAMBER] + ATMOSPHERE_PA
     line = air.tube_kg_s_pa2 * (block_pa - chamber_pa) * (block_pa + chamber_pa)

@@ -45,24 +45,25 @@ class LoadConfig(Table):
 
 
 class FaultConfig(Table):
-    """Something that breaks, and perhaps is whole again. Times count from the plant's start."""
+    """Something that breaks, and perhaps is whole again. Times count from what `faults_from` says."""
 
     kind: Literal[
         "chamber_bias", "chamber_stuck", "analog_silent", "angle_bias", "rate_bias", "angle_stuck", "inclinometer_silent",
         "noise", "commands_lost", "driver_silent", "supply_loss", "hose_burst", "charge_stuck", "exhaust_stuck", "power_loss",
+        "charge_leak",
     ] = Field(description="what breaks; see docs/exactness.md")  # fmt: skip
     on_s: float = Field(ge=0, description="when it breaks")
     off_s: float = Field(1e9, gt=0, description="default: it stays broken")
-    size: float = Field(0.0, description="bias: kPa, deg, deg/s; noise: times the own; supply_loss: part; hose_burst: mm2")
+    size: float = Field(0.0, description="bias: kPa, deg, deg/s; noise: times the own; supply_loss: part; others: mm2")
 
     @model_validator(mode="after")
     def _makes_sense(self) -> FaultConfig:
-        sized = ("chamber_bias", "angle_bias", "rate_bias", "noise", "supply_loss", "hose_burst")
+        sized = ("chamber_bias", "angle_bias", "rate_bias", "noise", "supply_loss", "hose_burst", "charge_leak")
         if not self.on_s < self.off_s:
             raise ValueError(f"on_s must be before off_s, got {self.on_s} and {self.off_s}")
         if (self.kind in sized) != (self.size != 0.0):
             raise ValueError(f"kind '{self.kind}' {'needs a' if self.kind in sized else 'has no'} size")
-        if (self.kind in ("noise", "supply_loss", "hose_burst") and self.size < 0) or (
+        if (self.kind in ("noise", "supply_loss", "hose_burst", "charge_leak") and self.size < 0) or (
             self.kind == "supply_loss" and self.size > 1
         ):
             raise ValueError(f"size of '{self.kind}' is out of range, got {self.size}")
@@ -100,6 +101,9 @@ class PlantConfig(Table):
 
     loads: tuple[LoadConfig, ...] = Field((), max_length=16, description="payloads and contacts, each a [[plant.loads]]")
     faults: tuple[FaultConfig, ...] = Field((), max_length=16, description="what breaks and when, each a [[plant.faults]]")
+    faults_from: Literal["start", "armed"] = Field(
+        "start", description="what the times of faults count from: the plant's start, or the gate's arming (wall pace)"
+    )
     dump_valve: bool = Field(False, description="a normally-open valve that vents the chamber when the driver has no power")
 
     @model_validator(mode="after")

@@ -17,7 +17,7 @@ from softloop.wire.messages import constant, names_of
 
 _NEVER_NS = np.iinfo(np.int64).max
 FAULTS = {name: number for number, name in names_of("Event", "FAULT_").items()}
-SIZED = ("chamber_bias", "angle_bias", "rate_bias", "noise", "supply_loss", "hose_burst")
+SIZED = ("chamber_bias", "angle_bias", "rate_bias", "noise", "supply_loss", "hose_burst", "charge_leak")
 _M2 = 1e-6
 
 
@@ -30,7 +30,7 @@ ANGLE_BIAS, RATE_BIAS, ANGLE_STUCK = _fault("ANGLE_BIAS"), _fault("RATE_BIAS"), 
 INCLINOMETER_SILENT, NOISE = _fault("INCLINOMETER_SILENT"), _fault("NOISE")
 COMMANDS_LOST, DRIVER_SILENT, POWER_LOSS = _fault("COMMANDS_LOST"), _fault("DRIVER_SILENT"), _fault("POWER_LOSS")
 SUPPLY_LOSS, HOSE_BURST = _fault("SUPPLY_LOSS"), _fault("HOSE_BURST")
-CHARGE_STUCK, EXHAUST_STUCK = _fault("CHARGE_STUCK"), _fault("EXHAUST_STUCK")
+CHARGE_STUCK, EXHAUST_STUCK, CHARGE_LEAK = _fault("CHARGE_STUCK"), _fault("EXHAUST_STUCK"), _fault("CHARGE_LEAK")
 
 
 @kernel(types.void(PLANT_TYPE, STATE_TYPE))
@@ -44,12 +44,26 @@ def plan_faults(params: Any, state: Any) -> None:
                     state.next_fault_ns = min(state.next_fault_ns, at_ns)
 
 
+def begin_faults(params: Any, state: Any, waiting: Any, shift_ns: int) -> None:
+    """Let the faults in `waiting`, whose times count from later than the plant's start, be those of the plant from now on.
+
+    Args:
+        waiting: a copy of `params.faults`.
+        shift_ns: from the plant's start to the instant that their times count from.
+    """
+    soon_ns = int(state.t_ns) - int(state.start_ns) + 1
+    for place, fault in zip(params.faults, waiting, strict=True):
+        place["kind"], place["magnitude"] = fault["kind"], fault["magnitude"]
+        place["on_ns"], place["off_ns"] = max(soon_ns, fault["on_ns"] + shift_ns), fault["off_ns"] + shift_ns
+    plan_faults(params, state)
+
+
 @kernel(types.void(STATE_TYPE))
 def _mend(state: Any) -> None:
     """Nothing is broken."""
     broken = state.broken
     broken.chamber_bias_kpa, broken.angle_bias_deg, broken.rate_bias_deg_s = 0.0, 0.0, 0.0
-    broken.noise, broken.supply_lost, broken.burst_m2 = 0.0, 0.0, 0.0
+    broken.noise, broken.supply_lost, broken.burst_m2, broken.charge_leak_m2 = 0.0, 0.0, 0.0, 0.0
     broken.chamber_stuck, broken.analog_silent, broken.angle_stuck, broken.inclinometer_silent = 0, 0, 0, 0
     broken.commands_lost, broken.driver_silent, broken.power_lost = 0, 0, 0
     broken.charge_stuck, broken.exhaust_stuck = 0, 0
@@ -70,6 +84,8 @@ def _break_sized(state: Any, kind: int, size: float) -> None:
         broken.supply_lost = min(1.0, broken.supply_lost + size)
     elif kind == HOSE_BURST:
         broken.burst_m2 += _M2 * size
+    elif kind == CHARGE_LEAK:
+        broken.charge_leak_m2 += _M2 * size
 
 
 @kernel(types.void(STATE_TYPE, types.i8))

@@ -12,10 +12,12 @@ import numpy as np
 
 from softloop.plant.config import PlantProcess
 from softloop.plant.electrical import next_event_ns, run_until
+from softloop.plant.faults import begin_faults
 from softloop.plant.records import EVENT, EVENT_DRIVER, EVENT_FAULT, EVENT_LOAD, EVENT_TRUTH
 from softloop.plant.setup import PERIOD_NS, WireTimes, new_device, new_state, plant_record
 from softloop.plant.wires import CanSide, Outbox, SerialSide
 from softloop.wire.channels import TRUTH
+from softloop.wire.faults import when_armed
 from softloop.wire.messages import constant, message
 from softloop.wire.shell import Context
 from softloop.wire.status import EventReporter, StatusReporter
@@ -37,6 +39,10 @@ class Plant:
         self._device = new_device(plant)
         self._params = plant_record(plant, WireTimes(config.valves_bus.bitrate, config.analog_bus.bitrate))
         self._events = np.zeros(_EVENTS, EVENT)
+        self._waiting = self._params.faults.copy()
+        self._armed_ns = when_armed(context.wire) if plant.faults_from == "armed" else None
+        if self._armed_ns is not None:
+            self._params.faults["kind"] = 0
         self._warm()
         self._outbox = Outbox()
         self._can = CanSide(config, context)
@@ -87,6 +93,7 @@ class Plant:
     def _take(self, kind: int, sample_ns: int, end_ns: int, raw: list[int], value: float) -> None:
         if kind == EVENT_TRUTH:
             self._publish_truth()
+            self._await_arming()
             self._serial.listen(self._params, self._state, self._outbox)
         elif kind == EVENT_LOAD:
             self._reporter.say(KIND_LOAD, sample_ns, code=raw[0], reason=raw[1], value=value)
@@ -96,6 +103,13 @@ class Plant:
             self._reporter.say(KIND_DRIVER, sample_ns, code=raw[0])
         else:
             self._outbox.add(end_ns, kind, raw)
+
+    def _await_arming(self) -> None:
+        """Where faults count from the gate's arming: let them begin when it is known."""
+        armed_ns = self._armed_ns() if self._armed_ns is not None else None
+        if armed_ns is not None:
+            self._armed_ns = None
+            begin_faults(self._params, self._state, self._waiting, armed_ns - int(self._state.start_ns))
 
     def _publish_truth(self) -> None:
         truth = self._state.truth

@@ -163,6 +163,7 @@ BROKEN = record_dtype(
         ("noise", "f8"),  # times the sensors' own, besides it
         ("supply_lost", "f8"),  # part of the supply pressure
         ("burst_m2", "f8"),  # an opening beside the leak
+        ("charge_leak_m2", "f8"),  # an opening beside the charge valve
         ("chamber_stuck", "u1"),
         ("analog_silent", "u1"),
         ("angle_stuck", "u1"),

@@ -177,6 +177,7 @@ class Wire:
     Attributes:
         exact: at lockstep pace: who sends waits for who reads, and equal runs give equal bytes.
         on_put: told of each payload on a channel of the 5 ms path before it is sent.
+        spoil: changes how a channel is published, where faults are injected into it.
     """
 
     def __init__(self, session: zenoh.Session, bench: str, process: str) -> None:
@@ -185,13 +186,15 @@ class Wire:
         self.process = process
         self.exact = False
         self.on_put: Callable[[bytes], None] | None = None
+        self.spoil: Callable[[Channel, Callable[[bytes], None]], Callable[[bytes], None]] | None = None
         self._token: Any = None
 
     def publisher(self, channel: Channel) -> Callable[[bytes], None]:
         """A function that publishes a payload on a channel. At wall pace it never waits: what cannot be sent is dropped."""
         publisher = self.declare_publisher(key(self.bench, channel), realtime=channel.realtime)
         put: Callable[[bytes], None] = publisher.put
-        return self._noted(put) if channel.realtime and self.on_put else put
+        put = self._noted(put) if channel.realtime and self.on_put else put
+        return put if self.spoil is None else self.spoil(channel, put)
 
     def _noted(self, put: Callable[[bytes], None]) -> Callable[[bytes], None]:
         def put_noted(payload: bytes) -> None:

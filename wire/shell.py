@@ -14,16 +14,22 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 
 from softloop.wire.clock import Clock
 from softloop.wire.config import HostConfig, ZenohConfig
 from softloop.wire.errors import EXIT_LOST, EXIT_OK, SoftloopError
-from softloop.wire.pace import Pace
+from softloop.wire.faults import NoFaults
+from softloop.wire.pace import ByteSource, FrameSource, Pace
 from softloop.wire.session import Wire, open_wire
+
+if TYPE_CHECKING:
+    from softloop.wire.can_port import CanPort
 
 _MCL_CURRENT_FUTURE_ONFAULT = 1 | 2 | 4  # sys/mman.h; on fault: lock what is touched, not all that is mapped
 
@@ -59,11 +65,21 @@ class Context:
     stop: Stop = field(default_factory=Stop)
     realtime: bool = False
     on_begin: list[Callable[[], None]] = field(default_factory=list)
+    faults: NoFaults = field(default_factory=NoFaults)
+    event_numbers: Iterator[int] = field(default_factory=lambda: count(1))
 
     @property
     def clock(self) -> Clock:
         """The rig clock."""
         return self.pace.clock
+
+    def frames(self, port: CanPort, wire: int) -> FrameSource:
+        """The frames of one of the rig's wires (WIRE_*), at this run's pace and with the faults injected into it."""
+        return self.faults.frames(self.pace.frames(port, wire), port, wire)
+
+    def bytes(self, source: ByteSource, wire: int) -> ByteSource:
+        """Likewise the bytes."""
+        return self.faults.bytes(self.pace.bytes(source, wire), wire)
 
     def enter_loop(self) -> None:
         """Everything is built and warm: keep the collector out, show that this process is alive, and begin with the others.

@@ -68,12 +68,12 @@ class EventReporter:
         """`source`: Event SOURCE_* of this process."""
         self._put = context.wire.publisher(EVENT)
         self._source = source
-        self._seq = 0
+        self._numbers = context.event_numbers
 
     def say(self, kind: int, stamp_ns: int, *, code: int = 0, reason: int = 0, value: float = 0.0, tick: int = 0) -> None:
         """One event; `kind` is Event KIND_*, `stamp_ns` the rig clock."""
-        self._seq += 1
+        number = next(self._numbers)
         event = _EVENT.make(
-            seq=self._seq, stamp_ns=stamp_ns, tick=tick, value=value, source=self._source, kind=kind, code=code, reason=reason
+            seq=number, stamp_ns=stamp_ns, tick=tick, value=value, source=self._source, kind=kind, code=code, reason=reason
         )
         self._put(_EVENT.pack(event))

@@ -1,0 +1,99 @@
+"""What `[faults]` leaves to the launcher: processes killed, stopped, started anew, and a disk that is full for one of them."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from softloop.deploy.bench import Bench
+from softloop.deploy.children import Child, Children
+from softloop.deploy.rig_state import RigState
+from softloop.wire.channels import EVENT
+from softloop.wire.fault_config import LAUNCHER, InjectionConfig
+from softloop.wire.faults import KIND_FAULT, NUMBERS
+from softloop.wire.messages import constant, message
+from softloop.wire.session import Wire
+
+_EVENT = message("Event")
+_SOURCE = constant("Event", "SOURCE_LAUNCHER")
+_S = 1_000_000_000
+
+
+class Injector:
+    """Carries out the launcher's injections when the launcher looks, so up to a tenth of a second late; events say when."""
+
+    def __init__(self, bench: Bench, run_dir: Path, wire: Wire, children: Children, start: Callable[[str], None]) -> None:
+        self._waiting = [injection for _, injection in bench.faults.of_process(LAUNCHER)]
+        self._standing: list[InjectionConfig] = []
+        self._children, self._start = children, start
+        self._log = run_dir / bench.recorder.file if bench.recorder is not None else run_dir
+        self._put = wire.publisher(EVENT) if self._waiting else None
+        self._armed_ns: int | None = None
+        self._seq = 0
+
+    def act(self, state: RigState) -> None:
+        """Begin and end what is due now."""
+        if not self._waiting and not self._standing:
+            return
+        if self._armed_ns is None and state.armed:
+            self._armed_ns = int(state.valves.stamp_ns)
+        if self._armed_ns is None:
+            return
+        since_s = (time.monotonic_ns() - self._armed_ns) / _S
+        for injection in [i for i in self._waiting if i.at_s <= since_s]:
+            self._waiting.remove(injection)
+            if self._alive(injection) is None:
+                continue
+            self._standing.append(injection)
+            self._say(injection, 1)
+            self._begin(injection)
+        for injection in [i for i in self._standing if i.at_s + i.duration_s <= since_s]:
+            self._standing.remove(injection)
+            self._end(injection)
+            self._say(injection, 0)
+
+    def _alive(self, injection: InjectionConfig) -> Child | None:
+        """The process that it is done to; None where that is not there (any more): then nothing is done, and nothing said."""
+        child = self._children.all.get(injection.target)
+        return None if child is None or child.exit_code() is not None else child
+
+    def _begin(self, injection: InjectionConfig) -> None:
+        child = self._alive(injection)
+        if child is None:
+            return
+        if injection.kind == "process_stop":
+            child.popen.send_signal(signal.SIGSTOP)
+        elif injection.kind == "disk_full":
+            _limit_files(child, self._log.stat().st_size if self._log.is_file() else 0)
+        else:
+            child.popen.kill()
+            child.popen.wait()
+            if injection.kind == "process_restart":
+                self._start(injection.target)
+
+    def _end(self, injection: InjectionConfig) -> None:
+        child = self._alive(injection)
+        if child is None:
+            return
+        if injection.kind == "process_stop":
+            child.popen.send_signal(signal.SIGCONT)
+        elif injection.kind == "disk_full":
+            _limit_files(child, resource.RLIM_INFINITY)
+
+    def _say(self, injection: InjectionConfig, code: int) -> None:
+        if self._put is None:
+            return
+        self._seq += 1
+        what = {"source": _SOURCE, "kind": KIND_FAULT, "code": code, "reason": NUMBERS[injection.kind]}
+        event = _EVENT.make(seq=self._seq, stamp_ns=time.monotonic_ns(), **what)
+        self._put(_EVENT.pack(event))
+
+
+def _limit_files(child: Child, size: int) -> None:
+    """Let a process write no file longer than `size` bytes: each write beyond it fails, as on a full disk."""
+    _, hard = resource.prlimit(child.pid, resource.RLIMIT_FSIZE)
+    soft = hard if size == resource.RLIM_INFINITY else size
+    resource.prlimit(child.pid, resource.RLIMIT_FSIZE, (soft, hard))

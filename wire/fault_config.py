@@ -1,0 +1,110 @@
+"""`[faults]` of the bench file: what is injected on the host's side while a bench runs, and where.
+
+What breaks inside the simulated rig stands in `[[plant.faults]]`. What stands here is done to what devices and processes say to
+each other, by the process that hears or says it, so that it works on real devices too; or, by the launcher, to processes.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from softloop.wire.benchfile import Table
+
+ALWAYS_S = 1e9
+LINE_ACTIONS = ("drop", "delay", "duplicate", "reorder", "corrupt")
+# Kinds whose size means something, and what. All others have none; `corrupt` may have one.
+SIZED = {"delay": "ms", "step": "ms", "bias": "kPa, deg or deg/s", "noise": "its standard deviation"}
+# Target -> the process that injects.
+CAN_TARGETS = {"analog": "pressures", "driver": "valves", "command": "valves"}
+SERIAL_TARGETS = {"inclinometer": "inclinometer"}
+ZENOH_TARGETS = {"pressure": "pressures", "inclination": "inclinometer", "command": "controller", "valves": "valves"}
+SENSOR_TARGETS = {
+    "chamber_pressure": "pressures", "supply_pressure": "pressures", "angle": "inclinometer", "rate": "inclinometer",
+}  # fmt: skip
+PROCESSES = ("plant", "valves", "pressures", "inclinometer", "controller", "recorder")
+LAUNCHER = "launcher"
+TARGETS: dict[str, dict[str, str]] = {
+    "can": CAN_TARGETS,
+    "serial": SERIAL_TARGETS,
+    "zenoh": ZENOH_TARGETS,
+    "sensor": SENSOR_TARGETS,
+    "process": dict.fromkeys(PROCESSES, LAUNCHER),
+    "clock": {name: name for name in ("valves", "pressures", "inclinometer", "controller")},
+    "disk": {"recorder": LAUNCHER},
+}
+
+Kind = Literal[
+    "can_drop", "can_delay", "can_duplicate", "can_reorder", "can_corrupt", "can_error_frames", "can_bus_off",
+    "serial_drop", "serial_delay", "serial_duplicate", "serial_reorder", "serial_corrupt",
+    "zenoh_drop", "zenoh_delay", "zenoh_duplicate", "zenoh_reorder", "zenoh_corrupt",
+    "sensor_stuck", "sensor_bias", "sensor_noise", "sensor_nan",
+    "process_kill", "process_stop", "process_restart", "clock_step", "disk_full",
+]  # fmt: skip
+
+
+class InjectionConfig(Table):
+    """One thing that goes wrong between devices and processes. Times count from the instant at which the gate is armed."""
+
+    kind: Kind = Field(description="what goes wrong; see docs/faults.md")
+    target: str = Field("", description="where: a wire, a channel, a sensor's value or a process, as docs/faults.md lists them")
+    at_s: float = Field(ge=0, description="when it begins")
+    duration_s: float = Field(ALWAYS_S, gt=0, description="default: it stays")
+    probability: float = Field(1.0, gt=0, le=1, description="how likely each frame, byte, sample or value is hit")
+    size: float = Field(0.0, description="delay, step: ms; bias: kPa, deg, deg/s; noise: its deviation; corrupt: bits, 0 is one")
+
+    @property
+    def family(self) -> str:
+        """What it is done to: can, serial, zenoh, sensor, process, clock, disk."""
+        return self.kind.partition("_")[0]
+
+    @property
+    def action(self) -> str:
+        """What is done."""
+        return self.kind.partition("_")[2]
+
+    @property
+    def process(self) -> str:
+        """The process that does it."""
+        return TARGETS[self.family][self.target]
+
+    @property
+    def has_chance(self) -> bool:
+        """It hits things one by one, each with its probability."""
+        return self.family in ("can", "serial", "zenoh", "sensor")
+
+    @property
+    def needs_wall(self) -> bool:
+        """It is done to a process or to its clock, which at lockstep pace wait for each other."""
+        return self.process == LAUNCHER or self.family == "clock"
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> InjectionConfig:
+        allowed = TARGETS[self.family]
+        if self.target not in allowed:
+            names = ", ".join(name for name in allowed if name) or "(none)"
+            raise ValueError(f"kind '{self.kind}' has no target '{self.target}'; it has: {names}")
+        if self.target == "command" and self.action in ("error_frames", "bus_off"):
+            raise ValueError(f"kind '{self.kind}' has no target 'command'; a node's trouble is that of target 'driver'")
+        if (self.action in SIZED) != (self.size != 0.0) and self.action != "corrupt":
+            needs = f"needs a size ({SIZED[self.action]})" if self.action in SIZED else "has no size"
+            raise ValueError(f"kind '{self.kind}' {needs}")
+        if self.size < 0 and self.action not in ("bias", "step"):
+            raise ValueError(f"size of '{self.kind}' must be above 0, got {self.size:g}")
+        if self.probability != 1.0 and not self.has_chance:
+            raise ValueError(f"kind '{self.kind}' has no probability")
+        return self
+
+
+class FaultsConfig(Table):
+    """`[faults]`: what is injected on the host's side, each a `[[faults.injections]]`; see docs/faults.md."""
+
+    seed: int = Field(1, ge=0, description="of what is left to chance; equal seeds give equal injections at lockstep pace")
+    injections: tuple[InjectionConfig, ...] = Field(
+        (), max_length=32, description="what goes wrong, each a [[faults.injections]]"
+    )
+
+    def of_process(self, process: str) -> list[tuple[int, InjectionConfig]]:
+        """(place in the list, injection) of all that a process injects."""
+        return [(i, injection) for i, injection in enumerate(self.injections) if injection.process == process]
