@@ -30,13 +30,23 @@ def run(
         Path | None,
         typer.Option(metavar="SCENARIO.toml", help="Let things go wrong, and judge how that ends; see `softloop faults`."),
     ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="What `softloop doctor --certificate` wrote: into the log.")
+    ] = None,
 ) -> int:
     """Run a bench: start its processes, arm, watch, vent, stop, summary and report."""
     from softloop.deploy.bench import find_bench
     from softloop.deploy.launcher import Options, launch
 
     options = Options(
-        run_dir=run_dir, duration_s=duration, report=False if no_report else None, quiet=quiet, pace=pace, page=page
+        run_dir=run_dir,
+        duration_s=duration,
+        report=False if no_report else None,
+        quiet=quiet,
+        pace=pace,
+        page=page,
+        foxglove=foxglove,
+        certificate=certificate,
     )
     if faults is not None:
         from softloop.deploy.faults import run_with_faults
@@ -272,7 +282,8 @@ def prepare(bench: BenchArgument, run_dir: RunDir) -> int:
 
 
 # After these in the list of commands; each enters itself.
-import softloop.deploy.cli_campaigns  # noqa: E402, F401
+import softloop.deploy.cli_campaigns  # noqa: E402
+import softloop.deploy.cli_machine  # noqa: E402, F401
 
 
 def main(arguments: list[str] | None = None) -> None:

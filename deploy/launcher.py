@@ -23,7 +23,7 @@ from softloop.deploy.prepare import prepare_in_child
 from softloop.deploy.progress import compile_progress
 from softloop.deploy.rig_state import GATE_FAULT, RigState
 from softloop.deploy.router import launcher_wire, remove_sockets
-from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench, make_run_dir
+from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench, keep_certificate, make_run_dir
 from softloop.wire.channels import HELLO
 from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, BadConfig
 from softloop.wire.lockstep import Lockstep
@@ -57,6 +57,7 @@ class Options:
     pace: Literal["wall", "lockstep"] | None = None
     page: bool = False
     foxglove: bool = False
+    certificate: Path | None = None
 
 
 def _conclude(bench: Bench, run_dir: Path, outcome: Outcome, *, quiet: bool) -> int:
@@ -77,6 +78,7 @@ def launch(bench_file: Path, options: Options, then: Callable[..., int] = _concl
         run_dir = make_run_dir(bench, options.run_dir)
         bench = _with_options(load_bench(bench_file, run_dir), options)
         keep_bench(run_dir, bench)
+        keep_certificate(run_dir, bench)
         with compile_progress(quiet=options.quiet) as progress:
             prepared = prepare_in_child(run_dir / BENCH_FILE, run_dir, stop, progress)
         with (
@@ -97,11 +99,13 @@ def onlookers(run_dir: Path, options: Options) -> list[list[str]]:
 
 def _with_options(bench: Bench, options: Options) -> Bench:
     """The bench with what the command line changes."""
-    changed: dict[str, float | bool] = {}
+    changed: dict[str, float | bool | str] = {}
     if options.duration_s is not None:
         changed["duration_s"] = options.duration_s
     if options.report is not None:
         changed["report"] = options.report
+    if options.certificate is not None:
+        changed["certificate"] = str(options.certificate)
     paced = bench.pace if options.pace is None else bench.pace.model_copy(update={"mode": options.pace})
     return bench.model_copy(update={"run": bench.run.model_copy(update=changed), "pace": paced})
 

@@ -1,0 +1,37 @@
+# ruff: noqa: PLC0415 - as in `deploy.cli`
+"""Commands about the computer that a bench runs on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from softloop.deploy.cli_app import BenchArgument, app
+from softloop.wire.errors import EXIT_OK
+
+
+@app.command()
+def doctor(
+    bench: BenchArgument,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.5, max=3600.0, help="For each thing that is listened to.")] = 5.0,
+    certificate: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the outcome here too; `[run] certificate` puts it into each log.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
+) -> int:
+    """Accept the computer and the devices before the rig runs: permissions, lateness, Zenoh, CAN, inclinometer, disk."""
+    from softloop.deploy.doctor import doctor as examine
+
+    return examine(bench, seconds, certificate, as_json=as_json)
+
+
+@app.command("doctor-ticks", hidden=True)
+def doctor_ticks(bench: BenchArgument, seconds: Annotated[float, typer.Option(metavar="S")] = 5.0) -> int:
+    """The doctor's helper: what a process of the 5 ms path sees of this machine, as JSON."""
+    from softloop.deploy.bench import find_bench, load_bench
+    from softloop.deploy.doctor_ticks import measure_as_child
+
+    measure_as_child(load_bench(find_bench(bench)), seconds)
+    return EXIT_OK
