@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Literal
+from typing import Literal, Self
 
 from softloop.deploy.bench import Bench, load_bench
 from softloop.deploy.beside import beside
 from softloop.deploy.children import Child, Children
 from softloop.deploy.conclude import conclude
 from softloop.deploy.gate_requests import Requests, ask
+from softloop.deploy.keeper import Keeper, Kept
 from softloop.deploy.live import View, make_view
-from softloop.deploy.node import STOP_ORDER, processes_of
+from softloop.deploy.node import KEPT_PROCESSES, STOP_ORDER, processes_of
 from softloop.deploy.prepare import prepare_in_child
+from softloop.deploy.process_events import ProcessEvents
 from softloop.deploy.progress import compile_progress
 from softloop.deploy.rig_state import GATE_FAULT, RigState
 from softloop.deploy.router import launcher_wire, remove_sockets
@@ -77,10 +80,11 @@ def launch(bench_file: Path, options: Options) -> int:
         with (
             launcher_wire(bench) as wire,
             closing(make_view(prepared.trajectory_s, quiet=options.quiet)) as view,
-            beside(onlookers(run_dir, options), run_dir, view.say),
+            beside(onlookers(run_dir, options), run_dir, view.say) as viewers,
         ):
             kind = Launch if bench.pace.mode == "wall" else LockstepLaunch
-            outcome = kind(bench, run_dir, wire, view, stop, Children(), prepared.trajectory_s).run()
+            launch = kind(bench, run_dir, wire, view, stop, Children(), prepared.trajectory_s)
+            outcome = launch.looking_after(viewers).run()
         return conclude(bench, run_dir, outcome.code, outcome.text, began=outcome.began, quiet=options.quiet)
 
 
@@ -133,8 +137,15 @@ class Launch:
         self.state = RigState(wire)
         self.requests = Requests(wire)
         self.children = children
+        self.keeper = Keeper(view.say, ProcessEvents(wire).tell)
         self.words: dict[str, str] = {}
         self.all_alive = False
+
+    def looking_after(self, viewers: Iterable[Kept]) -> Self:
+        """Bring back the viewers too when they die."""
+        for kept in viewers:
+            self.keeper.keep(kept, time.monotonic())
+        return self
 
     def run(self) -> Outcome:
         """Start, arm, watch; then vent and stop, whatever happened."""
@@ -154,9 +165,14 @@ class Launch:
 
     def _start(self) -> None:
         for process in processes_of(self.bench):
-            arguments = ["node", process.name, str(self.run_dir / BENCH_FILE), "--run-dir", str(self.run_dir)]
-            self.children.start(process.name, arguments, self.run_dir / f"{process.name}.log")
-            self.words[process.name] = "starting"
+            self._start_one(process.name)
+
+    def _start_one(self, name: str) -> Child:
+        if name in self.children.all:  # one that was killed left its socket
+            remove_sockets(self.bench, self.children.all[name].pid)
+        arguments = ["node", name, str(self.run_dir / BENCH_FILE), "--run-dir", str(self.run_dir)]
+        self.words[name] = "starting"
+        return self.children.start(name, arguments, self.run_dir / f"{name}.log")
 
     def _wait_alive(self) -> Outcome | None:
         deadline = time.monotonic() + self.bench.run.ready_timeout_s
@@ -174,7 +190,20 @@ class Launch:
             limit = self.bench.run.ready_timeout_s
             return Outcome(EXIT_LOST, f"not alive after {limit:g} s: {self._last_words(missing)}; see the logs in {self.run_dir}")
         self.all_alive = True
+        self._keep_listeners()
         return None
+
+    def _keep_listeners(self) -> None:
+        """From now on those that only listen are brought back when they die. At lockstep pace none is: all wait for all."""
+        for name in KEPT_PROCESSES:
+            if name in self.children.all:
+                kept = Kept(self.children.all[name], partial(self._start_one, name), partial(self._is_alive, name), needed=True)
+                self.keeper.keep(kept, time.monotonic())
+
+    def _is_alive(self, name: str) -> bool:
+        alive = name in self.wire.processes_alive(timeout_s=POLL_S)
+        self.words[name] = "alive" if alive else self.words[name]
+        return alive
 
     def _last_words(self, names: set[str]) -> str:
         said = {name: self.children.all[name].last_line() for name in sorted(names)}
@@ -209,7 +238,7 @@ class Launch:
         """Why the run cannot go on, or None."""
         if self.stop:
             return Outcome(EXIT_INTERRUPTED, f"interrupted ({self.stop.reason})")
-        ended = self.children.ended()
+        ended = self.children.ended(but=self.keeper.names)
         if ended is not None:
             return self._lost(ended)
         if self.state.gate == GATE_FAULT:
@@ -252,6 +281,7 @@ class Launch:
     def _refresh(self, stage: str) -> None:
         for line in self.state.refresh():
             self.view.say(line)
+        self.keeper.look(time.monotonic())
         self._show(stage)
 
     def _show(self, stage: str) -> None:
@@ -260,6 +290,9 @@ class Launch:
 
 class LockstepLaunch(Launch):
     """A run at lockstep pace: planned beforehand, tick by tick, and over when the plant has taken the last one."""
+
+    def _keep_listeners(self) -> None:
+        pass
 
     def _until_over(self) -> Outcome:
         self._start()

@@ -27,7 +27,7 @@ ANYTHING = st.fixed_dictionaries(
         "ready": st.integers(0, 1),
         "bus_off": st.integers(0, 1),
         "driver": st.sampled_from([g.DRIVER_OK, g.DRIVER_WATCHDOG, g.DRIVER_SILENT]),
-        "stop": st.integers(0, 1),
+        "stop": st.integers(0, 3),
         "disarm": st.integers(0, 1),
         "shutdown": st.integers(0, 1),
     },
