@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections import namedtuple
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from softloop.deploy.bench import monitor_process
 from softloop.offline.log import Log
@@ -18,22 +17,37 @@ from softloop.watch.monitor import limits_of
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK
 from softloop.wire.messages import names_of
 
-FIELDS = (
-    "tick", "stamp_ns", "phase", "mode", "theta", "charge_current_ma", "exhaust_current_ma", "error_deg", "s1_deg_s", "s2_kpa",
-    "desired_pressure_kpa", "saturated", "inputs_valid",
-)  # fmt: skip
-Row = namedtuple("Row", FIELDS)
 NAMES = names_of("Event", "INVARIANT_")
 
 
+class Row(NamedTuple):
+    """The fields of a cycle record that `judge` reads, as plain numbers."""
+
+    tick: int
+    stamp_ns: int
+    phase: int
+    mode: int
+    theta: list[float]
+    charge_current_ma: float
+    exhaust_current_ma: float
+    error_deg: float
+    s1_deg_s: float
+    s2_kpa: float
+    desired_pressure_kpa: float
+    saturated: int
+    inputs_valid: int
+
+
 def rows_of(cycles: Any) -> Iterator[Row]:
-    """The fields that `judge` reads of an array of cycle records, as plain numbers."""
-    return (Row(*values) for values in zip(*(cycles[name].tolist() for name in FIELDS), strict=True))
+    """An array of cycle records, (n,), one by one."""
+    return (Row(*values) for values in zip(*(cycles[name].tolist() for name in Row._fields), strict=True))
 
 
 def violations(limits: Limits, cycles: Any) -> list[dict[str, Any]]:
     """Every stretch of ticks on which an invariant does not hold: name, first and last tick, how many ticks, the worst value."""
-    memory, found, open_at = Memory(), [], {}
+    memory = Memory()
+    found: list[dict[str, Any]] = []
+    open_at: dict[int, dict[str, Any]] = {}
     for row in rows_of(cycles):
         memory, verdicts = judge(limits, memory, row)
         named = {verdict.invariant: verdict.value for verdict in verdicts}
