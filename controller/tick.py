@@ -116,13 +116,17 @@ def begin_approach(config: Any, model: Any, inputs: Any, knots: np.ndarray, tabl
 
 @kernel(types.void(CONFIG_TYPE, MODEL_TYPE, INPUTS_TYPE, array_of(_F8), array_of(_F8, 2), STATE_TYPE, SCRATCH_TYPE))
 def follow_phase(config: Any, model: Any, inputs: Any, knots: np.ndarray, table: np.ndarray, state: Any, scratch: Any) -> None:
-    """WAIT -> APPROACH once armed with valid inputs -> TRACK -> DONE; back to WAIT whenever the gate is not armed."""
+    """WAIT -> APPROACH once armed with valid inputs -> TRACK -> DONE; back to WAIT whenever the gate is not armed.
+
+    A rig that was armed in mid-vent still falls: the approach, which begins at rest, waits until the rig nearly does.
+    """
     armed = inputs.valves.gate == GATE_ARMED
     if not armed and state.phase != PHASE_DONE:
         state.phase = PHASE_WAIT
         for i in range(state.approach.size):  # an approach that was broken off must not go on in the log beyond its end
             state.approach[i] = 0.0
-    if state.phase == PHASE_WAIT and armed and inputs_valid(config, inputs):
+    resting = abs(inputs.inclination.rate_deg_s) <= config.rest_deg_s
+    if state.phase == PHASE_WAIT and armed and resting and inputs_valid(config, inputs):
         begin_approach(config, model, inputs, knots, table, state, scratch)
     if state.phase == PHASE_APPROACH and inputs.now_ns - state.phase_start_ns >= config.approach_ns:
         state.phase = PHASE_TRACK

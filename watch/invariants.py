@@ -34,10 +34,10 @@ _ROUNDING = 1e-9  # of a parameter's bound, relative
 
 @dataclass(frozen=True)
 class Limits:
-    """Where the invariants end. One that is not watched has no limit (inf), or an empty set.
+    """Where the invariants end. One that is not watched has no limit (inf); the sets also serve the bound.
 
     Attributes:
-        theta: (lowest, highest) of each estimate.
+        theta: (lowest, highest) of each estimate. watch_theta: an estimate outside is a verdict of its own.
         current_max_ma: saturation of both currents.
         error_max_deg, error_ticks: the envelope, and for how many ticks in a row it must be left.
         switches_max: changes of the working mode within one second.
@@ -47,6 +47,7 @@ class Limits:
     """
 
     theta: tuple[tuple[float, float], ...] = ()
+    watch_theta: bool = True
     current_max_ma: float = inf
     error_max_deg: float = inf
     error_ticks: int = 1
@@ -105,7 +106,7 @@ def judge(limits: Limits, memory: Memory, cycle: Any) -> tuple[Memory, tuple[Ver
     after = Memory(
         int(cycle.mode),
         _switches(memory, cycle),
-        memory.error_ticks + 1 if cycle.phase == _TRACK and not abs(cycle.error_deg) <= limits.error_max_deg else 0,
+        memory.error_ticks + 1 if _error_outside(limits, cycle) else 0,
         memory.settled_ticks + 1 if inside and _assumed(limits, cycle) else 0,
         int(cycle.tick),
     )
@@ -116,7 +117,7 @@ def judge(limits: Limits, memory: Memory, cycle: Any) -> tuple[Memory, tuple[Ver
 def _of_this_record(limits: Limits, cycle: Any) -> list[Verdict]:
     found = []
     outside = _parameter_outside(limits, cycle)
-    if outside is not None:
+    if limits.watch_theta and outside is not None:
         found.append(Verdict(PARAMETERS, float(outside)))
     for current in (cycle.charge_current_ma, cycle.exhaust_current_ma):
         if isfinite(limits.current_max_ma) and not 0.0 <= current <= limits.current_max_ma:
@@ -147,6 +148,11 @@ def _parameter_outside(limits: Limits, cycle: Any) -> int | None:
         if not low - slack <= value <= high + slack:
             return place
     return None
+
+
+def _error_outside(limits: Limits, cycle: Any) -> bool:
+    watched = isfinite(limits.error_max_deg) and cycle.phase == _TRACK
+    return watched and not abs(cycle.error_deg) <= limits.error_max_deg
 
 
 def _switches(memory: Memory, cycle: Any) -> tuple[int, ...]:

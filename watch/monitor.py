@@ -42,7 +42,8 @@ def limits_of(process: MonitorProcess, parameters: Parameters) -> Limits:
         bound = {"v2_max": table.bound_margin * v2, "rho": law.rho, "desired_max_kpa": law.desired_max_kpa}
         bound["settled_ticks"] = settling_ticks(decay)
     return Limits(
-        theta=tuple((low, high) for _, low, high in in_theta_order(parameters)) if table.parameters else (),
+        theta=tuple((low, high) for _, low, high in in_theta_order(parameters)),
+        watch_theta=table.parameters,
         current_max_ma=parameters.pneumatics.current_max_ma if table.command else inf,
         error_max_deg=table.error_max_deg if table.error and process.angle else inf,
         error_ticks=max(1, round(table.error_s / PERIOD_S)),

@@ -1,4 +1,5 @@
 from collections import namedtuple
+from dataclasses import replace
 from math import exp, inf, nan
 
 import pytest
@@ -95,6 +96,12 @@ def test_the_bound_is_asked_for_only_where_its_assumptions_have_held():
     assert BOUND not in judged(large, large, large | {"theta": (2.0, -2.5)}, large, large)[4]
     assert judged(*[{"s2_kpa": 4.5}] * 3)[2].keys() == {BOUND}
     assert judged(*[{"s2_kpa": 4.0}] * 3)[2] == {}
+
+
+def test_sets_that_are_not_watched_still_serve_the_bound():
+    limits, large = replace(LIMITS, watch_theta=False), {"s1_deg_s": 15.0}
+    assert judged(*[large | {"theta": (2.0, -2.5)}] * 5, limits=limits) == [{}] * 5
+    assert judged(*[large] * 3, limits=limits)[2].keys() == {BOUND}
 
 
 def test_nothing_is_judged_while_the_rig_rests():
