@@ -32,7 +32,7 @@ class MonitorConfig(Table):
     error_max_deg: float = Field(30.0, gt=0, le=360, description="its envelope, either way")
     error_s: float = Field(0.1, ge=0, le=60, description="for how long it must be left")
     chatter: bool = Field(True, description="watch the changes of the working mode")
-    switches_per_s: float = Field(50.0, gt=0, le=200, description="more of them within one second are chattering")
+    switches_per_s: float = Field(80.0, gt=0, le=200, description="more of them within one second are chattering")
     bound: bool = Field(True, description="watch Eq. 50's ultimate bound where its assumptions hold; laws arc and smc")
     bound_margin: float = Field(1.5, ge=1, le=100, description="times the bound: sampling and delays are not in its proof")
     poll_s: float = Field(0.005, gt=0, le=1, description="how often arrived records are judged")
