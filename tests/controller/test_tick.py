@@ -69,13 +69,14 @@ def test_a_gate_that_disarms_sends_it_back_to_wait_with_no_current(controller):
 def test_rearming_begins_anew_from_what_is_measured(controller, law):
     for k in range(60):
         fed(controller, k, angle=40.0 + 0.1 * k, pressure=30.0 + 0.2 * k)
-    fed(controller, 60, armed=False)
+    for k in range(60, 63):  # the currents of two ticks count in the prediction
+        fed(controller, k, armed=False)
     controller.state[0].theta[:] = controller.model[0].theta_max  # as if learned before the fault
-    first = fed(controller, 61, angle=55.0, pressure=20.0)
+    first = fed(controller, 63, angle=55.0, pressure=20.0)
     assert first.phase == r.PHASE_APPROACH
     fresh = built(law)
     fresh.state[0].last_ns = controller.inputs[0].now_ns - PERIOD_NS
-    expected = fed(fresh, 61, angle=55.0, pressure=20.0)
+    expected = fed(fresh, 63, angle=55.0, pressure=20.0)
     for name in (
         "theta",
         "charge_current_ma",
