@@ -131,6 +131,14 @@ def log_repair(
     return repair_run(run, output)
 
 
+@log_app.command("invariants")
+def log_invariants(run: RunArgument, as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False) -> int:
+    """Judge a log by the invariants that the monitor watches; exit code 1 when one does not hold."""
+    from softloop.deploy.log_invariants import check_invariants
+
+    return check_invariants(run, as_json=as_json)
+
+
 @app.command()
 def same(
     first: Annotated[Path, typer.Argument(metavar="RUN_A", help="A run directory, or a log in it.")],

@@ -12,6 +12,7 @@ from softloop.deploy.bench import load_bench
 from softloop.deploy.children import Children
 from softloop.deploy.launcher import Launch
 from softloop.deploy.live import PlainView
+from softloop.deploy.node import processes_of
 from softloop.deploy.router import launcher_wire
 from softloop.deploy.run_dir import bench_lock, keep_bench
 from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, Unavailable
@@ -53,11 +54,11 @@ class Said(PlainView):
         self.lines.append(line)
 
 
-def launch(run_dir, wrong, stop=None, **changes):
+def launch(run_dir, wrong, stop=None, more="", **changes):
     """Run the toy bench; returns how it ended, what was said and the children."""
     file = run_dir / "toy.toml"
     limits = LIMITS | changes
-    file.write_text(BENCH + "[run]\n" + "".join(f"{key} = {value}\n" for key, value in limits.items()))
+    file.write_text(BENCH + more + "[run]\n" + "".join(f"{key} = {value}\n" for key, value in limits.items()))
     (run_dir / "toy.json").write_text(json.dumps(wrong))
     bench = load_bench(file, run_dir)
     keep_bench(run_dir, bench)
@@ -99,6 +100,31 @@ def test_a_process_that_dies_while_running_is_lost_and_named(short_dir, name):
     outcome, _, _ = launch(short_dir, {"controller": "endless"} | {name: "dies_armed"})
     assert outcome.code == EXIT_LOST
     assert f"process '{name}' ended with code 7" in outcome.text
+
+
+def test_a_recorder_that_dies_is_started_again_and_the_run_goes_on(short_dir):
+    wrong = {"controller": "endless", "recorder": "dies_once"}
+    outcome, lines, children = launch(short_dir, wrong, more="[recorder]\n", duration_s=6.0)
+    assert (outcome.code, outcome.text) == (EXIT_OK, "ended after 6 s as asked")
+    assert "process 'recorder' ended with code 7" in "\n".join(lines)
+    assert "process 'recorder' is back" in lines
+    events = [line for line in lines if line.startswith("launcher: recorder")]
+    assert events[0] == "launcher: recorder was lost"
+    assert events[1].startswith("launcher: recorder is back after ")
+    assert children.all["recorder"].exit_code() == 0
+
+
+def test_a_recorder_that_cannot_start_ends_the_run(short_dir):
+    outcome, _, _ = launch(short_dir, {"recorder": "dies"}, more="[recorder]\n")
+    assert outcome.code == 3
+    assert "the cable is out" in outcome.text
+
+
+@pytest.mark.parametrize("order", [reversed, lambda names: names[2:] + names[:2]])
+def test_the_order_of_starting_does_not_matter(short_dir, monkeypatch, order):
+    monkeypatch.setattr("softloop.deploy.launcher.processes_of", lambda bench: tuple(order(processes_of(bench))))
+    outcome, _, _ = launch(short_dir, {}, more="[recorder]\n")
+    assert outcome.code == EXIT_OK, outcome.text
 
 
 def test_a_gate_fault_ends_the_run_with_its_reason(short_dir):
