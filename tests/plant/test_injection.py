@@ -33,8 +33,8 @@ def outcome(make):
 @given(
     st.sampled_from(["break", "mend"]),
     st.sampled_from([*KINDS, ""]),
-    st.one_of(st.just(0.0), FINITE),
-    st.one_of(st.just(0.0), FINITE),
+    NUMBER,
+    NUMBER,
 )
 def test_a_request_is_refused_in_one_line_or_comes_through_the_wire_as_it_was(action, kind, size, duration_s):
     asked = {"action": action, "kind": kind, "size": size, "duration_s": duration_s}
