@@ -40,7 +40,7 @@ def test_what_the_page_shows_is_logged_and_its_stop_vents(chromium, request, tmp
             rows = np.array(view.evaluate(ALL_KEPT))
             start_ns = view.evaluate("softloop.state.start_ns")
             if shots:
-                view.screenshot(path=Path(shots) / "page.png")
+                view.screenshot(path=Path(shots) / "page.png", full_page=True)
             box = view.locator("#stop").bounding_box()
             view.mouse.move(box["x"] + 20, box["y"] + 20)
             view.evaluate("document.addEventListener('pointerdown', (e) => { window.clickedAt = e.timeStamp; }, true)")
