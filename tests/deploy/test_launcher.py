@@ -4,6 +4,7 @@ import shutil
 import sys
 import tempfile
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from softloop.deploy.node import processes_of
 from softloop.deploy.router import launcher_wire
 from softloop.deploy.run_dir import bench_lock, keep_bench
 from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, Unavailable
-from softloop.wire.session import open_router, open_wire
+from softloop.wire.session import Wire, open_router, open_wire
 from softloop.wire.shell import Stop
 
 TOY = (sys.executable, str(Path(__file__).with_name("toy_node.py")))
@@ -52,6 +53,13 @@ class Said(PlainView):
 
     def say(self, line):
         self.lines.append(line)
+
+
+def wait_for(condition, timeout_s=10.0):
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
 
 
 def launch(run_dir, wrong, stop=None, more="", **changes):
@@ -171,10 +179,13 @@ def test_a_shared_meeting_point_must_be_there_and_know_nobody_of_the_bench(short
     bench = load_bench(file, short_dir)
     with pytest.raises(Unavailable, match="no router at "), launcher_wire(bench):
         pass
-    with open_router(bench.zenoh, bench.name):
+    with open_router(bench.zenoh, bench.name) as session:
+        meeting = Wire(session, bench.name, "router")
         with open_wire(bench.zenoh, bench.name, "plant") as plant:
             plant.declare_alive()
+            wait_for(lambda: meeting.processes_alive() == {"plant"})
             with pytest.raises(Unavailable, match=r"bench 'toy' is running already at .*m\.sock: plant"), launcher_wire(bench):
                 pass
+        wait_for(lambda: not meeting.processes_alive())
         with launcher_wire(bench) as wire:
             assert wire.processes_alive() == {"launcher"}
