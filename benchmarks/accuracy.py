@@ -33,7 +33,7 @@ from softloop.dynamics.bending import bending_acceleration
 from softloop.dynamics.parameters import KV1_CHARGE, KV1_EXHAUST, KV6_CHARGE, KV6_EXHAUST, load_parameters, model_record, shipped
 from softloop.dynamics.pneumatics import pressure_rate
 from softloop.dynamics.valve import g3, g4
-from softloop.offline.log import find_log, open_log
+from softloop.offline.run_log import open_run
 from softloop.plant.config import PlantConfig
 from softloop.plant.physics import advance
 from softloop.plant.records import ANGLE, CHAMBER, TUBE
@@ -179,7 +179,7 @@ def measure(runs: list[Path], seeds: range, seconds: float, progress: Progress) 
             made = progress.track(RUNS, description="running T2 at wall pace")
             runs = [make_run(Path(folder), layer, seed) for layer, seed in made]
         for run in progress.track(runs, description="replaying"):
-            judge(of_log(open_log(find_log(run)), seconds), table)
+            judge(of_log(open_run(run), seconds), table)
         for seed in progress.track(seeds, description="closed loop"):
             currents = of_closed_loop("rig", seed)
             judge(currents.until(currents.from_ns * 1e-9 + seconds), table)

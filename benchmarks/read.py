@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from mcap.reader import make_reader
 
-from softloop.offline.log import Log, find_log, open_log
+from softloop.offline.log import Log, open_log
+from softloop.offline.run_log import find_log
 
 
 def read_raw(path: Path) -> int:

@@ -111,6 +111,9 @@ class ControllerConfig(Table):
     trajectory: str = Field("t1", description="t1, t2, excitation_1hz, excitation_05hz, or the path of a CSV file t_s, value")
     trajectory_seed: int = Field(1, ge=0, le=2**32 - 1, description="phases of the multi-sines")
     approach_s: float = Field(4.0, gt=0, le=60, description="length of the smooth move to the first point")
+    rest_deg_s: float = Field(
+        10.0, gt=0, description="an armed rig that moves faster waits, both valves shut, before it approaches"
+    )
     predict: bool = Field(True, description="carry the measured state on to the time at which the command acts")
     actuation_delay_ms: float = Field(3.0, ge=0, le=160, description="declared, from tick to valve opening")
     pressure_delay_ms: float = Field(1.5, ge=0, le=100, description="declared lag of the pressure sensor before its stamp")

@@ -199,6 +199,7 @@ CONFIG = record_dtype(
         ("pressure_delay_ns", "i8"),  # declared lag of the sensor ahead of its stamp
         ("inclination_delay_ns", "i8"),
         ("actuation_delay_ns", "i8"),  # from tick to valve opening
+        ("rest_deg_s", "f8"),  # the approach begins at no higher rate
         ("predict", "u1"),
         ("observe", "u1"),  # the law is given the observer's state
     ]

@@ -118,6 +118,7 @@ def config_record(config: ControllerConfig, plan: Plan) -> Any:
     record.law = LAWS[config.law]
     record.period_ns = PERIOD_NS
     record.approach_ns = round(config.approach_s * 1e9)
+    record.rest_deg_s = config.rest_deg_s
     record.plan_kind, record.plan_ns = plan.kind, plan.duration_ns
     record.pressure_budget_ns = round(config.pressure_budget_ms * MS)
     record.inclination_budget_ns = round(config.inclination_budget_ms * MS)

@@ -95,9 +95,12 @@ def move_between(start: float, end: Any, seconds: float, coefficients: np.ndarra
     coefficients[7] = (-20.0 * gap + 10.0 * v - 2.0 * a + j / 6.0) / seconds**7
 
 
-@kernel(types.void(CONFIG_TYPE, INPUTS_TYPE, array_of(_F8), array_of(_F8, 2), STATE_TYPE, SCRATCH_TYPE))
-def begin_approach(config: Any, inputs: Any, knots: np.ndarray, table: np.ndarray, state: Any, scratch: Any) -> None:
-    """Start the smooth move from where the rig is to the trajectory's first point (value and three derivatives)."""
+@kernel(types.void(CONFIG_TYPE, MODEL_TYPE, INPUTS_TYPE, array_of(_F8), array_of(_F8, 2), STATE_TYPE, SCRATCH_TYPE))
+def begin_approach(config: Any, model: Any, inputs: Any, knots: np.ndarray, table: np.ndarray, state: Any, scratch: Any) -> None:
+    """Start the smooth move from where the rig is to the trajectory's first point (value and three derivatives).
+
+    Nothing of what was learned before is kept: what led to a fault may have taught it.
+    """
     reference_at(config.plan_kind, knots, table, 0.0, scratch.end)
     start = inputs.pressure.chamber_pressure_kpa if config.law == LAW_PRESSURE else inputs.inclination.angle_deg
     move_between(start, scratch.end, 1e-9 * config.approach_ns, state.approach)
@@ -106,19 +109,25 @@ def begin_approach(config: Any, inputs: Any, knots: np.ndarray, table: np.ndarra
     state.pid.integral_kpa = inputs.pressure.chamber_pressure_kpa
     state.mode = MODE_HOLD
     state.mode_ticks = 0
+    for i in range(state.theta.size):
+        state.theta[i] = model.theta[i]
     begin_observer(inputs, state.observer)
 
 
-@kernel(types.void(CONFIG_TYPE, INPUTS_TYPE, array_of(_F8), array_of(_F8, 2), STATE_TYPE, SCRATCH_TYPE))
-def follow_phase(config: Any, inputs: Any, knots: np.ndarray, table: np.ndarray, state: Any, scratch: Any) -> None:
-    """WAIT -> APPROACH once armed with valid inputs -> TRACK -> DONE; back to WAIT whenever the gate is not armed."""
+@kernel(types.void(CONFIG_TYPE, MODEL_TYPE, INPUTS_TYPE, array_of(_F8), array_of(_F8, 2), STATE_TYPE, SCRATCH_TYPE))
+def follow_phase(config: Any, model: Any, inputs: Any, knots: np.ndarray, table: np.ndarray, state: Any, scratch: Any) -> None:
+    """WAIT -> APPROACH once armed with valid inputs -> TRACK -> DONE; back to WAIT whenever the gate is not armed.
+
+    A rig that was armed in mid-vent still falls: the approach, which begins at rest, waits until the rig nearly does.
+    """
     armed = inputs.valves.gate == GATE_ARMED
     if not armed and state.phase != PHASE_DONE:
         state.phase = PHASE_WAIT
         for i in range(state.approach.size):  # an approach that was broken off must not go on in the log beyond its end
             state.approach[i] = 0.0
-    if state.phase == PHASE_WAIT and armed and inputs_valid(config, inputs):
-        begin_approach(config, inputs, knots, table, state, scratch)
+    resting = abs(inputs.inclination.rate_deg_s) <= config.rest_deg_s
+    if state.phase == PHASE_WAIT and armed and resting and inputs_valid(config, inputs):
+        begin_approach(config, model, inputs, knots, table, state, scratch)
     if state.phase == PHASE_APPROACH and inputs.now_ns - state.phase_start_ns >= config.approach_ns:
         state.phase = PHASE_TRACK
         state.phase_start_ns += config.approach_ns
@@ -248,7 +257,7 @@ def controller_tick(
     """
     measurement, reference, demand = scratch.measurement, scratch.reference, scratch.demand
     valid = inputs_valid(config, inputs)
-    follow_phase(config, inputs, knots, table, state, scratch)
+    follow_phase(config, model, inputs, knots, table, state, scratch)
     active = state.phase == PHASE_APPROACH or state.phase == PHASE_TRACK
     if config.observe and active:
         read_samples(config, inputs, state, measurement)

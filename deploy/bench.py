@@ -9,7 +9,7 @@ do not meet on one, and `{bench_dir}` the folder of the file the text stands in.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from softloop.controller.config import ControllerConfig
 from softloop.deploy.config import RunConfig
 from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig, pressures_process, valves_process
 from softloop.plant.config import PlantConfig, plant_process
-from softloop.watch.config import FoxgloveConfig, PageConfig, RecorderConfig
+from softloop.watch.config import FoxgloveConfig, LawGains, MonitorConfig, MonitorProcess, PageConfig, RecorderConfig
 from softloop.wire.benchfile import Table, load_model, read_toml, validated
 from softloop.wire.can_config import CanConfig
 from softloop.wire.config import HostConfig, PaceConfig, ZenohConfig
@@ -32,7 +32,7 @@ NAME = r"^[a-z0-9_-]{1,24}$"
 MAX_BASES = 8
 FIRST_PORT, PORTS = 20_000, 12_000
 # In the order in which they are started; any order works.
-PROCESS_NAMES = ("recorder", "plant", "valves", "pressures", "inclinometer", "controller")
+PROCESS_NAMES = ("recorder", "monitor", "plant", "valves", "pressures", "inclinometer", "controller")
 
 Key = tuple[str, ...]
 
@@ -52,6 +52,7 @@ class Bench(Table):
     inclinometer: InclinometerConfig | None = None
     controller: ControllerConfig | None = None
     recorder: RecorderConfig | None = None
+    monitor: MonitorConfig | None = None
     page: PageConfig = PageConfig()
     foxglove: FoxgloveConfig = FoxgloveConfig()
     faults: FaultsConfig = FaultsConfig()
@@ -140,7 +141,18 @@ def process_config(bench: Bench, name: str) -> Any:
         if bench.pressures is None or bench.inclinometer is None:
             raise BadConfig("key 'valves': the gate needs the tables [pressures] and [inclinometer] too")
         return valves_process(table, bench.pressures, bench.inclinometer, bench.can)
+    if name == "monitor":
+        if bench.controller is None:
+            raise BadConfig("key 'monitor': the monitor needs the table [controller] too")
+        return monitor_process(table, bench.controller)
     return table
+
+
+def monitor_process(table: MonitorConfig, controller: ControllerConfig) -> MonitorProcess:
+    """What the monitor is given of the controller's table."""
+    gains = {"arc": controller.arc, "smc": controller.smc}.get(controller.law)
+    law = None if gains is None else LawGains(**{f.name: getattr(gains, f.name) for f in fields(LawGains)})
+    return MonitorProcess(table, controller.parameters, law, controller.law != "pressure")
 
 
 def _check_together(bench: Bench, source: Source) -> None:

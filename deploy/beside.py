@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from softloop.deploy.children import PROGRAM, Child
+from softloop.deploy.keeper import Kept
 
 END_S = 5.0
 FIRST_WORD_S = 20.0
@@ -17,25 +18,29 @@ POLL_S = 0.2
 
 
 @contextlib.contextmanager
-def beside(commands: list[list[str]], run_dir: Path, say: Callable[[str], None]) -> Iterator[None]:
+def beside(commands: list[list[str]], run_dir: Path, say: Callable[[str], None]) -> Iterator[list[Kept]]:
     """Run `softloop COMMAND` for each while the block lasts, its words in `COMMAND.log`, the first one said.
 
-    The run does not depend on them: one that cannot start, or ends, is said and no more.
+    The run does not depend on them: one that cannot start, or ends, is said. Gives them to whoever brings back one that dies.
     """
-    started = [_start(command, run_dir / f"{command[0]}.log") for command in commands]
+    started = [_kept(command, run_dir / f"{command[0]}.log") for command in commands]
     try:
-        for child in started:
-            threading.Thread(target=_say_first_word, args=(child, say), daemon=True).start()
-        yield
+        for kept in started:
+            threading.Thread(target=_say_first_word, args=(kept.child, say), daemon=True).start()
+        yield started
     finally:
-        for child in started:
-            child.popen.terminate()
-        for child in started:
-            _wait(child)
+        for kept in started:
+            kept.child.popen.terminate()
+        for kept in started:
+            _wait(kept.child)
+
+
+def _kept(command: list[str], log: Path) -> Kept:
+    return Kept(_start(command, log), lambda: _start(command, log))
 
 
 def _start(command: list[str], log: Path) -> Child:
-    with log.open("wb") as output:
+    with log.open("ab") as output:
         popen = subprocess.Popen(
             [*PROGRAM, *command], stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
         )

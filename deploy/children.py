@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,9 +78,9 @@ class Children:
         self.all: dict[str, Child] = {}
 
     def start(self, name: str, arguments: Sequence[str], log: Path) -> Child:
-        """Start `PROGRAM ARGUMENTS --lifeline-fd N`."""
+        """Start `PROGRAM ARGUMENTS --lifeline-fd N`; one of the same name, which has ended, goes out of sight."""
         command = [*self._program, *arguments, "--lifeline-fd", str(self._read_end)]
-        with log.open("wb") as output:
+        with log.open("ab") as output:  # what one said that died before stays
             popen = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -93,9 +93,9 @@ class Children:
         self.all[name] = Child(name, popen, log)
         return self.all[name]
 
-    def ended(self) -> Child | None:
-        """A child that is no longer running, if there is one."""
-        return next((c for c in self.all.values() if c.exit_code() is not None), None)
+    def ended(self, but: Collection[str] = ()) -> Child | None:
+        """A child that is no longer running, if there is one, other than those named in `but`."""
+        return next((c for c in self.all.values() if c.name not in but and c.exit_code() is not None), None)
 
     def stop(self, order: Iterable[Sequence[str]], timeout_s: float) -> list[Child]:
         """Ask each group in turn to end, and kill what has not after `timeout_s`; returns the killed ones."""

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from softloop.deploy.cli_app import EXIT_CODES, BenchArgument, OptionalBench, RunArgument, RunDir, app, log_app
-from softloop.wire.errors import EXIT_LOST, EXIT_OK, EXIT_USAGE, SoftloopError
+from softloop.wire.errors import EXIT_LOST, EXIT_OK, EXIT_USAGE, BadConfig, SoftloopError
 
 
 @app.command(epilog=EXIT_CODES)
@@ -38,16 +38,11 @@ def run(
     from softloop.deploy.bench import find_bench
     from softloop.deploy.launcher import Options, launch
 
+    report = False if no_report else None
     options = Options(
-        run_dir=run_dir,
-        duration_s=duration,
-        report=False if no_report else None,
-        quiet=quiet,
-        pace=pace,
-        page=page,
-        foxglove=foxglove,
+        run_dir=run_dir, duration_s=duration, report=report, quiet=quiet, pace=pace, page=page, foxglove=foxglove,
         certificate=certificate,
-    )
+    )  # fmt: skip
     if faults is not None:
         from softloop.deploy.faults import run_with_faults
 
@@ -87,14 +82,29 @@ def check(bench: BenchArgument) -> int:
 @app.command()
 def request(
     bench: BenchArgument,
-    action: Annotated[Literal["arm", "disarm", "stop"], typer.Argument(help="stop: emergency stop, FAULT until armed again.")],
-    timeout: Annotated[float, typer.Option(metavar="S", min=0.1, help="How long to wait for the gate's answer.")] = 5.0,
+    action: Annotated[
+        Literal["arm", "disarm", "stop", "fault", "mend"],
+        typer.Argument(help="stop: emergency stop, FAULT until armed again. fault, mend: of a simulated rig."),
+    ],
+    kind: Annotated[
+        str, typer.Argument(metavar="[KIND]", help="What breaks or is mended, as in [[plant.faults]]; mend: default all.")
+    ] = "",
+    size: Annotated[float, typer.Option(metavar="X", help="Of a fault that has one.")] = 0.0,
+    seconds: Annotated[float, typer.Option("--for", metavar="S", help="How long it stays. Default: until mended.")] = 0.0,
+    timeout: Annotated[float, typer.Option(metavar="S", min=0.1, help="How long to wait for the answer.")] = 5.0,
 ) -> int:
-    """Ask the gate of a running bench to arm, disarm or stop, and report its answer."""
+    """Ask the gate of a running bench to arm, disarm or stop, or its simulated rig to break, and report the answer."""
     from softloop.deploy.bench import find_bench, load_bench
+    from softloop.deploy.fault_requests import request_fault
     from softloop.deploy.gate_requests import request_once
 
-    return request_once(load_bench(find_bench(bench)), action, timeout)
+    loaded = load_bench(find_bench(bench))
+    if action == "fault" or action == "mend":
+        asked = {"action": "break" if action == "fault" else "mend", "kind": kind, "size": size, "duration_s": seconds}
+        return request_fault(loaded, asked, timeout)
+    if kind or size or seconds:
+        raise BadConfig(f"request {action}: KIND, --size and --for go with fault and mend")
+    return request_once(loaded, action, timeout)
 
 
 @app.command()
@@ -139,6 +149,14 @@ def log_repair(
     from softloop.deploy.log_tools import repair_run
 
     return repair_run(run, output)
+
+
+@log_app.command("invariants")
+def log_invariants(run: RunArgument, as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False) -> int:
+    """Judge a log by the invariants that the monitor watches; exit code 1 when one does not hold."""
+    from softloop.deploy.log_invariants import check_invariants
+
+    return check_invariants(run, as_json=as_json)
 
 
 @app.command()

@@ -31,11 +31,11 @@ def judge(run: Path, *, report: bool, quiet: bool) -> None:
     """
     from rich.console import Console  # noqa: PLC0415 - what follows brings numba and matplotlib: only once the rig has stopped
 
-    from softloop.offline.log import find_log, open_log  # noqa: PLC0415
     from softloop.offline.report import make_report  # noqa: PLC0415
+    from softloop.offline.run_log import open_run  # noqa: PLC0415
     from softloop.offline.summary import summary_table, write_summary  # noqa: PLC0415
 
-    log = open_log(find_log(run))
+    log = open_run(run)
     summary = write_summary(run, log)
     page = make_report(run, log, summary) if report else None
     if not summary["evidence_valid"]:

@@ -18,9 +18,11 @@ from softloop.offline.identification.intervals import Uncertainty
 from softloop.offline.identification.output_error import Fit, score
 from softloop.offline.identification.series import Series
 from softloop.offline.identification.structure import PAPER, bare_of
-from softloop.offline.log import Log, find_log, open_log
+from softloop.offline.log import Log
+from softloop.offline.run_log import find_log, open_run
 from softloop.wire.benchfile import validated
 from softloop.wire.errors import BadConfig, BadFile
+from softloop.wire.log_parts import parts_of
 
 BOUND_ERRORS = 3.0  # "three standard deviations of the means", as the paper has it
 
@@ -40,7 +42,7 @@ def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty
     """
     if not runs or bare_of(fit.structure) != PAPER:
         raise BadConfig("--output needs logs, orders 2,0,3 and one pressure: that is the model which the controller has")
-    log = open_log(find_log(runs[0]))
+    log = open_run(runs[0])
     content = _base(log)
     content |= {"name": file.stem, "bending": _bending(sure)}
     content["evidence"] = _evidence([runs[0], *runs], log, fit, sure, series)
@@ -92,7 +94,7 @@ def _run(path: Path, fit: Fit, series: Series, *, trained: bool) -> dict[str, An
     counted = series.time_s[series.counted]
     return {
         "name": series.name,
-        "sha256": hashlib.sha256(find_log(path).read_bytes()).hexdigest(),
+        "sha256": hashlib.sha256(b"".join(part.read_bytes() for part in parts_of(find_log(path)))).hexdigest(),
         "start_s": float(counted[0]),
         "end_s": float(counted[-1]),
         "fit_percent": fit.fits[0] if trained else score(fit, series),

@@ -24,7 +24,7 @@ from softloop.offline.identification.series import Series, from_log
 from softloop.offline.identification.structure import PAPER, Structure, bare_of
 from softloop.offline.identification.valve_flow import FlowTests, fit_valve
 from softloop.offline.identification.venting import fit_vent, score_vent
-from softloop.offline.log import find_log, open_log
+from softloop.offline.run_log import open_run
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
 
 
@@ -146,7 +146,7 @@ def _data(asked: Asked) -> tuple[Series, list[Series]]:
         columns = parse_map(asked.columns)
         series = [read_csv(path, columns) for path in asked.csv]
         return series[0], series[1:]
-    series = [from_log(open_log(find_log(run)), run.name) for run in asked.runs]
+    series = [from_log(open_run(run), run.name) for run in asked.runs]
     first, second = halves(series[0])
     return first, [second, *series[1:]]
 

@@ -10,29 +10,26 @@ from pathlib import Path
 
 from softloop.deploy.bench import Bench
 from softloop.deploy.children import Child, Children
+from softloop.deploy.launcher_events import LauncherEvents
 from softloop.deploy.rig_state import RigState
-from softloop.wire.channels import EVENT
 from softloop.wire.fault_config import LAUNCHER, InjectionConfig
-from softloop.wire.faults import KIND_FAULT, NUMBERS
-from softloop.wire.messages import constant, message
-from softloop.wire.session import Wire
+from softloop.wire.faults import NUMBERS
 
-_EVENT = message("Event")
-_SOURCE = constant("Event", "SOURCE_LAUNCHER")
 _S = 1_000_000_000
 
 
 class Injector:
     """Carries out the launcher's injections when the launcher looks, so up to a tenth of a second late; events say when."""
 
-    def __init__(self, bench: Bench, run_dir: Path, wire: Wire, children: Children, start: Callable[[str], None]) -> None:
+    def __init__(
+        self, bench: Bench, run_dir: Path, events: LauncherEvents, children: Children, start: Callable[[str], None]
+    ) -> None:
         self._waiting = [injection for _, injection in bench.faults.of_process(LAUNCHER)]
         self._standing: list[InjectionConfig] = []
         self._children, self._start = children, start
         self._log = run_dir / bench.recorder.file if bench.recorder is not None else run_dir
-        self._put = wire.publisher(EVENT) if self._waiting else None
+        self._events = events
         self._armed_ns: int | None = None
-        self._seq = 0
 
     def act(self, state: RigState) -> None:
         """Begin and end what is due now."""
@@ -48,12 +45,12 @@ class Injector:
             if self._alive(injection) is None:
                 continue
             self._standing.append(injection)
-            self._say(injection, 1)
+            self._events.fault(NUMBERS[injection.kind], 1)
             self._begin(injection)
         for injection in [i for i in self._standing if i.at_s + i.duration_s <= since_s]:
             self._standing.remove(injection)
             self._end(injection)
-            self._say(injection, 0)
+            self._events.fault(NUMBERS[injection.kind], 0)
 
     def _alive(self, injection: InjectionConfig) -> Child | None:
         """The process that it is done to; None where that is not there (any more): then nothing is done, and nothing said."""
@@ -82,14 +79,6 @@ class Injector:
             child.popen.send_signal(signal.SIGCONT)
         elif injection.kind == "disk_full":
             _limit_files(child, resource.RLIM_INFINITY)
-
-    def _say(self, injection: InjectionConfig, code: int) -> None:
-        if self._put is None:
-            return
-        self._seq += 1
-        what = {"source": _SOURCE, "kind": KIND_FAULT, "code": code, "reason": NUMBERS[injection.kind]}
-        event = _EVENT.make(seq=self._seq, stamp_ns=time.monotonic_ns(), **what)
-        self._put(_EVENT.pack(event))
 
 
 def _limit_files(child: Child, size: int) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Literal
+from typing import Literal, Self
 
 from softloop.deploy.bench import Bench, load_bench
 from softloop.deploy.beside import beside
@@ -17,8 +18,10 @@ from softloop.deploy.children import Child, Children
 from softloop.deploy.conclude import conclude
 from softloop.deploy.gate_requests import Requests, ask
 from softloop.deploy.injector import Injector
+from softloop.deploy.keeper import Keeper, Kept
+from softloop.deploy.launcher_events import LauncherEvents
 from softloop.deploy.live import View, make_view
-from softloop.deploy.node import STOP_ORDER, processes_of
+from softloop.deploy.node import KEPT_PROCESSES, STOP_ORDER, processes_of
 from softloop.deploy.prepare import prepare_in_child
 from softloop.deploy.progress import compile_progress
 from softloop.deploy.rig_state import GATE_FAULT, RigState
@@ -84,10 +87,11 @@ def launch(bench_file: Path, options: Options, then: Callable[..., int] = _concl
         with (
             launcher_wire(bench) as wire,
             closing(make_view(prepared.trajectory_s, quiet=options.quiet)) as view,
-            beside(onlookers(run_dir, options), run_dir, view.say),
+            beside(onlookers(run_dir, options), run_dir, view.say) as viewers,
         ):
             kind = Launch if bench.pace.mode == "wall" else LockstepLaunch
-            outcome = kind(bench, run_dir, wire, view, stop, Children(), prepared.trajectory_s).run()
+            launch = kind(bench, run_dir, wire, view, stop, Children(), prepared.trajectory_s)
+            outcome = launch.looking_after(viewers).run()
         return then(bench, run_dir, outcome, quiet=options.quiet)
 
 
@@ -142,9 +146,17 @@ class Launch:
         self.state = RigState(wire)
         self.requests = Requests(wire)
         self.children = children
+        events = LauncherEvents(wire)
+        self.keeper = Keeper(view.say, events.process)
         self.words: dict[str, str] = {}
         self.all_alive = False
-        self.injector = Injector(bench, run_dir, wire, children, self.start_process)
+        self.injector = Injector(bench, run_dir, events, children, self._start_killed)
+
+    def looking_after(self, viewers: Iterable[Kept]) -> Self:
+        """Bring back the viewers too when they die."""
+        for kept in viewers:
+            self.keeper.keep(kept, time.monotonic())
+        return self
 
     def run(self) -> Outcome:
         """Start, arm, watch; then vent and stop, whatever happened."""
@@ -164,13 +176,20 @@ class Launch:
 
     def _start(self) -> None:
         for process in processes_of(self.bench):
-            self.start_process(process.name)
-            self.words[process.name] = "starting"
+            self._start_one(process.name)
 
-    def start_process(self, name: str) -> None:
+    def _start_one(self, name: str) -> Child:
         """Start a process of the bench, or start it anew."""
+        if name in self.children.all:  # one that was killed left its socket
+            remove_sockets(self.bench, self.children.all[name].pid)
         arguments = ["node", name, str(self.run_dir / BENCH_FILE), "--run-dir", str(self.run_dir)]
-        self.children.start(name, arguments, self.run_dir / f"{name}.log")
+        self.words[name] = "starting"
+        return self.children.start(name, arguments, self.run_dir / f"{name}.log")
+
+    def _start_killed(self, name: str) -> None:
+        """After an injection; what is kept anyway comes back by itself."""
+        if name not in self.keeper.names:
+            self._start_one(name)
 
     def _wait_alive(self) -> Outcome | None:
         deadline = time.monotonic() + self.bench.run.ready_timeout_s
@@ -188,7 +207,20 @@ class Launch:
             limit = self.bench.run.ready_timeout_s
             return Outcome(EXIT_LOST, f"not alive after {limit:g} s: {self._last_words(missing)}; see the logs in {self.run_dir}")
         self.all_alive = True
+        self._keep_listeners()
         return None
+
+    def _keep_listeners(self) -> None:
+        """From now on those that only listen are brought back when they die. At lockstep pace none is: all wait for all."""
+        for name in KEPT_PROCESSES:
+            if name in self.children.all:
+                kept = Kept(self.children.all[name], partial(self._start_one, name), partial(self._is_alive, name), needed=True)
+                self.keeper.keep(kept, time.monotonic())
+
+    def _is_alive(self, name: str) -> bool:
+        alive = name in self.wire.processes_alive(timeout_s=POLL_S)
+        self.words[name] = "alive" if alive else self.words[name]
+        return alive
 
     def _last_words(self, names: set[str]) -> str:
         said = {name: self.children.all[name].last_line() for name in sorted(names)}
@@ -223,7 +255,7 @@ class Launch:
         """Why the run cannot go on, or None."""
         if self.stop:
             return Outcome(EXIT_INTERRUPTED, f"interrupted ({self.stop.reason})")
-        ended = self.children.ended()
+        ended = self.children.ended(but=self.keeper.names)
         if ended is not None:
             return self._lost(ended)
         if self.state.gate == GATE_FAULT:
@@ -267,6 +299,7 @@ class Launch:
         for line in self.state.refresh():
             self.view.say(line)
         self.injector.act(self.state)
+        self.keeper.look(time.monotonic())
         self._show(stage)
 
     def _show(self, stage: str) -> None:
@@ -275,6 +308,9 @@ class Launch:
 
 class LockstepLaunch(Launch):
     """A run at lockstep pace: planned beforehand, tick by tick, and over when the plant has taken the last one."""
+
+    def _keep_listeners(self) -> None:
+        pass
 
     def _until_over(self) -> Outcome:
         self._start()

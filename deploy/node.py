@@ -34,6 +34,7 @@ class Process:
 
 _KNOWN = (
     Process("recorder", "softloop.watch.recorder", False, "SOURCE_RECORDER"),
+    Process("monitor", "softloop.watch.monitor", False, "SOURCE_MONITOR"),
     Process("plant", "softloop.plant.process", True, "SOURCE_PLANT"),
     Process("valves", "softloop.devices.valves", True, "SOURCE_GATE"),
     Process("pressures", "softloop.devices.pressures", True, "SOURCE_PRESSURES"),
@@ -42,12 +43,15 @@ _KNOWN = (
 )
 PROCESSES = tuple(sorted(_KNOWN, key=lambda process: PROCESS_NAMES.index(process.name)))
 # Together in each group. The gate vents while the plant still runs, and the recorder sees all of it.
-STOP_ORDER = (("controller",), ("valves",), ("pressures", "inclinometer", "plant"), ("recorder",))
+KEPT_PROCESSES = ("recorder", "monitor")  # those that only listen: brought back when they die
+WALL_PACE_ONLY = ("monitor",)  # its word would come at another tick each time; `softloop log invariants` says the same of a log
+STOP_ORDER = (("controller",), ("valves",), ("pressures", "inclinometer", "plant", "monitor"), ("recorder",))
 
 
 def processes_of(bench: Bench) -> tuple[Process, ...]:
-    """The processes whose tables stand in the bench."""
-    return tuple(p for p in PROCESSES if getattr(bench, p.name) is not None)
+    """The processes whose tables stand in the bench; at lockstep pace without those that keep no step."""
+    left_out = WALL_PACE_ONLY if bench.pace.mode == "lockstep" else ()
+    return tuple(p for p in PROCESSES if getattr(bench, p.name) is not None and p.name not in left_out)
 
 
 def find_process(bench: Bench, name: str) -> Process:

@@ -16,6 +16,7 @@ from softloop.controller.config import ControllerConfig
 from softloop.deploy.bench import Bench, find_bench, load_bench
 from softloop.deploy.children import PROGRAM
 from softloop.deploy.experiments import Experiments
+from softloop.deploy.fault_requests import offer_faults
 from softloop.deploy.launcher import stop_on_signals
 from softloop.deploy.rig_state import event_line
 from softloop.deploy.watching import overview_of
@@ -36,6 +37,7 @@ def page(bench_file: Path, port: int | None, *, launch: bool) -> int:
     config = bench.page if port is None else bench.page.model_copy(update={"port": port})
     feed = Feed(overview_of(bench), event_line, config.history_s)
     site = Site(feed, StopLine(), hello_of(bench))
+    offer_faults(site)
     with stop_on_signals() as stop, _experiments(bench, file, site, launch=launch):
         threading.Thread(target=_tell_bounds, args=(file, site), name="bounds", daemon=True).start()
         serve(site, config, bench.zenoh, bench.name, stop, _say_where)
@@ -69,7 +71,7 @@ def _experiments(bench: Bench, file: Path, site: Site, *, launch: bool) -> Itera
 
         runs.on_change = tell
         tell()
-        site.actions = {"start": runs.start, "end": runs.end}
+        site.actions = {**site.actions, "start": runs.start, "end": runs.end}
         site.hello["actions"] = sorted(site.actions)
         trajectories = dict.fromkeys((*TRAJECTORIES, bench.controller.trajectory))
         laws = get_args(ControllerConfig.model_fields["law"].annotation)

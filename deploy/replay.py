@@ -12,8 +12,8 @@ from typing import Any
 from softloop.controller.config import ControllerConfig
 from softloop.deploy.bench import find_bench, load_bench
 from softloop.deploy.progress import tick_progress
-from softloop.offline.log import find_log, open_log
 from softloop.offline.replay import Deviation, Difference, ReplayResult, installation_differences, logged_controller, replay
+from softloop.offline.run_log import open_run
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
 
 STRETCHES_SHOWN = 10
@@ -32,7 +32,7 @@ def replay_run(run: Path, controller: Path | None, *, as_json: bool) -> int:
         BadFile, BadConfig: the log or the bench file cannot be used.
     """
     other = None if controller is None else _controller_of(controller)
-    log = open_log(find_log(run))
+    log = open_run(run)
     elsewhere = installation_differences(log)
     if not as_json and elsewhere:
         print(f"this installation is not the one of the log: {'; '.join(elsewhere)}", flush=True)

@@ -22,6 +22,7 @@ REASONS = names_of("ValveStatus", "REASON_")
 DRIVERS = names_of("ValveStatus", "DRIVER_")
 PHASES = names_of("CycleRecord", "PHASE_")
 LOADS = {1: "payload", 2: "contact"}
+INVARIANTS = names_of("Event", "INVARIANT_")
 FAULTS = names_of("Event", "FAULT_")
 _KINDS = names_of("Event", "KIND_")
 _SOURCE_NAMES = {constant("Event", p.source): p.name for p in PROCESSES}
@@ -116,6 +117,11 @@ def _event_text(event: Any) -> str:
         return f"{LOADS.get(event.reason, 'load')} {'came' if event.code else 'left'} ({event.value:g})"
     if kind == "fault":
         return f"fault {FAULTS.get(event.reason, event.reason)} {'came' if event.code else 'left'} ({event.value:g})"
+    if kind == "invariant":
+        return f"invariant '{INVARIANTS.get(event.code, event.code)}' does not hold ({event.value:.4g})"
+    if kind == "process":
+        name = _SOURCE_NAMES.get(event.reason, "a viewer")
+        return f"{name} is back after {event.value:.1f} s" if event.code else f"{name} was lost"
     if kind == "driver":
         return f"valve driver {DRIVERS.get(event.code, event.code)}"
     if kind == "bus":

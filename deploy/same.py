@@ -11,7 +11,8 @@ from softloop.deploy.bench import Bench, load_bench
 from softloop.deploy.launcher import schedule_of
 from softloop.deploy.run_dir import BENCH_FILE
 from softloop.offline.closed_loop import Trace, ready_controller, simulate_trace
-from softloop.offline.log import Log, find_log, open_log
+from softloop.offline.log import Log
+from softloop.offline.run_log import open_run
 from softloop.offline.same import Apart, compare, differences, series_of
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
 
@@ -25,12 +26,12 @@ def same_runs(first: Path, second: Path | None, *, as_json: bool) -> int:
     Raises:
         BadFile, BadConfig: a log or its bench cannot be read, or its run was not at lockstep pace.
     """
-    log = open_log(find_log(first))
+    log = open_run(first)
     if second is None:
         trace = trace_of(load_bench(log.path.parent / BENCH_FILE, log.path.parent))
         found, messages, series = differences_from_batch(log, trace), _count(trace), len(vars(trace))
     else:
-        found, of_log = differences(log, open_log(find_log(second))), series_of(log)
+        found, of_log = differences(log, open_run(second)), series_of(log)
         messages, series = sum(len(records) for records in of_log.values()), len(of_log)
     if as_json:
         print(json.dumps({"same": not found, "differences": [asdict(apart) for apart in found]}, indent=2))

@@ -8,7 +8,7 @@ States and what leads where, as `NEXT` holds it. An event is what one step found
 | ARMED    | FAULT | FAULT     | DISARMED | ARMED | ARMED    |
 | FAULT    | FAULT | FAULT     | FAULT    | ARMED | FAULT    |
 
-- STOP: a stop request, held or not. DISARM: a request, or the process is about to end.
+- STOP: a stop request, of a person or of the monitor, held or not. DISARM: a request, or the process is about to end.
 - CONDITION: any of the reasons of `condition`: no arming while one holds, and FAULT when it comes up while armed.
 - ARM: an arm request that was not seen before (a new number of its requester). It is used up by the step that sees it: one
   that was refused has to be made anew.
@@ -55,6 +55,7 @@ REASON_DRIVER_SILENT = _word("REASON_DRIVER_SILENT")
 REASON_REQUEST = _word("REASON_REQUEST")
 REASON_NOT_READY = _word("REASON_NOT_READY")
 REASON_SHUTDOWN = _word("REASON_SHUTDOWN")
+REASON_INVARIANT = _word("REASON_INVARIANT")
 DRIVER_OK, DRIVER_WATCHDOG, DRIVER_SILENT = _word("DRIVER_OK"), _word("DRIVER_WATCHDOG"), _word("DRIVER_SILENT")
 
 EVENT_STOP, EVENT_CONDITION, EVENT_DISARM, EVENT_ARM, EVENT_NOTHING = range(5)
@@ -66,6 +67,8 @@ NEXT = np.array(
     ]
 )
 """New state by state (row) and event (column): the table above."""
+
+STOP_ASKED, STOP_INVARIANT = 1, 2  # bits of `stop`: an emergency stop, and a fault asked for by the monitor
 
 LATE_COMMANDS = 40  # a command so many numbers behind the last one came late by another way; farther behind, another counts
 REQUESTERS = 8  # whose last arm request is remembered; of more, the one heard first is forgotten
@@ -100,7 +103,7 @@ GATE_INPUT = record_dtype([
     ("charge_current_ma", _F8),
     ("exhaust_current_ma", _F8),
     ("ready", _I8),
-    ("stop", _I8),                  # 1: a stop request came
+    ("stop", _I8),                  # STOP_ASKED, STOP_INVARIANT or both: such requests came
     ("disarm", _I8),
     ("arm", _I8),                   # 1: an arm request came, of this requester and number
     ("arm_origin", _I8),
@@ -253,7 +256,7 @@ def change_state(config: Any, state: Any, given: Any, output: Any) -> None:
     before, why_before = state.gate, state.reason
     event = EVENT_NOTHING
     if given.stop != 0:
-        event, reason = EVENT_STOP, REASON_EMERGENCY_STOP
+        event, reason = EVENT_STOP, REASON_EMERGENCY_STOP if given.stop & STOP_ASKED else REASON_INVARIANT
     elif reason != REASON_NONE:
         event = EVENT_CONDITION
     elif given.shutdown != 0 or given.disarm != 0:

@@ -24,7 +24,8 @@ from softloop.wire.shell import Context, say
 from softloop.wire.status import EventReporter, StatusReporter
 
 _COMMAND, _REQUEST, _STATUS = message("ValveCommand"), message("GateRequest"), message("ValveStatus")
-_STOP, _DISARM, _ARM = (constant("GateRequest", f"ACTION_{a}") for a in ("STOP", "DISARM", "ARM"))
+_STOP, _FAULT, _DISARM, _ARM = (constant("GateRequest", f"ACTION_{a}") for a in ("STOP", "FAULT", "DISARM", "ARM"))
+_STOPS = {_STOP: g.STOP_ASKED, _FAULT: g.STOP_INVARIANT}
 _SOURCE = constant("Event", "SOURCE_GATE")
 _KIND_GATE, _KIND_DRIVER, _KIND_BUS = (constant("Event", f"KIND_{k}") for k in ("GATE", "DRIVER", "BUS"))
 _GATES, _REASONS = names_of("ValveStatus", "GATE_"), names_of("ValveStatus", "REASON_")
@@ -133,7 +134,7 @@ class ValvesLoop:
             except BadPayload:
                 self.status.dropped += 1
                 continue
-            given.stop |= request.action == _STOP
+            given.stop |= _STOPS.get(request.action, 0)
             given.disarm |= request.action == _DISARM
             if request.action == _ARM:
                 given.arm, given.arm_origin, given.arm_seq = 1, request.origin & _INT63, request.seq & _INT63

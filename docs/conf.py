@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 from softloop.deploy.cli import app as command_line
-from softloop.wire.channels import CHANNELS
+from softloop.wire.channels import CHANNELS, FAULT
 from softloop.wire.messages import MSG_DIR, message_names
 
 HERE = Path(__file__).resolve().parent
@@ -54,7 +54,7 @@ def _parameters(command: Any) -> Iterator[str]:
 
 def messages() -> str:
     """Every channel and every message definition, from the table and the files."""
-    rows = [f"| `{c.name}` | {c.message} | {c.rate_hz:g} | {'yes' if c.logged else 'no'} |" for c in CHANNELS]
+    rows = [f"| `{c.name}` | {c.message} | {c.rate_hz:g} | {'yes' if c.logged else 'no'} |" for c in (*CHANNELS, FAULT)]
     parts = ["# Channels and messages", "\n".join(["| channel | message | Hz | logged |", "|---|---|---|---|", *rows])]
     for name in message_names():
         parts += [f"## {name}", f"```\n{(MSG_DIR / f'{name}.msg').read_text().rstrip()}\n```"]

@@ -11,9 +11,10 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from softloop.offline.compare_figures import Shown, distribution, lateness, tracking
-from softloop.offline.log import Log, find_log, open_log
+from softloop.offline.log import Log
 from softloop.offline.metrics import SENSORS
 from softloop.offline.page import document, picture, text
+from softloop.offline.run_log import open_run
 from softloop.offline.summary import NONE, Value, shown, summarise
 from softloop.offline.vector import as_bytes, write
 from softloop.wire.errors import BadConfig, BadFile
@@ -62,7 +63,7 @@ def read_runs(paths: list[Path]) -> list[Run]:
         raise BadConfig(f"two to {RUNS_MAX} runs can be compared (got {len(paths)})")
     runs = []
     for label, path in zip(labels(paths), paths, strict=True):
-        log = open_log(find_log(path))
+        log = open_run(path)
         if not len(log["cycle"]):
             raise BadFile(f"{path}: no cycle record was logged, so there is nothing to compare")
         runs.append(Run(label, log, summarise(log)))

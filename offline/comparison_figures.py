@@ -12,7 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from softloop.offline.closed_loop import Run
-from softloop.offline.figures import BLACK, BLUE, DPI, GREY, ORANGE, RED
+from softloop.offline.figures import BLACK, BLUE, DPI, ORANGE, RED
+from softloop.wire.messages import names_of
 
 _STYLE: Any = {
     "font.size": 8.0,
@@ -23,7 +24,8 @@ _STYLE: Any = {
     "lines.linewidth": 0.9,
     "legend.frameon": False,
 }
-_ROWS = ("angle, deg", "error, deg", "chamber, kPa", "mode")
+_ROWS = ("angle, deg", "error, deg", "chamber, kPa", "working mode")
+_MODES = {number: name for number, name in names_of("ValveCommand", "MODE_").items() if number}
 _ERROR_SHOWN_DEG = 2.0
 
 
@@ -37,10 +39,17 @@ def side_by_side(runs: Mapping[str, Run], title: str) -> Figure:
             _draw(axes[:, column], law, run)
         for row, label in enumerate(_ROWS):
             axes[row, 0].set_ylabel(label)
-        axes[0, 0].legend(("reference", "true angle"))
-        axes[2, 0].legend(("desired", "true"))
+        for row in (0, 2):
+            _legend_above(axes[row, 0])
         figure.suptitle(title)
     return figure
+
+
+def _legend_above(axes: Any) -> None:
+    """A legend in a strip of its own over the curves, whatever these do."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.22 * (high - low))
+    axes.legend(loc="upper left", ncols=2, handlelength=1.5, columnspacing=1.0, borderaxespad=0.1)
 
 
 def _draw(axes: Any, law: str, run: Run) -> None:
@@ -48,14 +57,15 @@ def _draw(axes: Any, law: str, run: Run) -> None:
     cycles, truths = run.cycles[on], run.truths[on]
     time = 1e-9 * cycles["trajectory_ns"]
     error = truths["angle_deg"] - cycles["reference_deg"]
-    axes[0].plot(time, cycles["reference_deg"], color=GREY)
-    axes[0].plot(time, truths["angle_deg"], color=BLUE)
+    axes[0].plot(time, truths["angle_deg"], color=BLUE, linewidth=1.6, label="true angle")
+    axes[0].plot(time, cycles["reference_deg"], color=BLACK, linestyle=(0, (4, 3)), linewidth=0.8, label="reference")
     axes[1].plot(time, error, color=RED)
     axes[1].set_ylim(-_ERROR_SHOWN_DEG, _ERROR_SHOWN_DEG)
-    axes[2].plot(time, cycles["desired_pressure_kpa"], color=ORANGE)
-    axes[2].plot(time, truths["chamber_pressure_kpa"], color=BLACK)
+    axes[2].plot(time, cycles["desired_pressure_kpa"], color=ORANGE, label="desired")
+    axes[2].plot(time, truths["chamber_pressure_kpa"], color=BLACK, label="true")
     axes[3].step(time, cycles["mode"], color=BLACK, linewidth=0.4, where="post")
-    axes[3].set_yticks((1, 2, 3))
+    axes[3].set_yticks(list(_MODES), _MODES.values())
+    axes[3].set_ylim(min(_MODES) - 0.3, max(_MODES) + 0.3)
     axes[3].set_xlabel("time, s")
     axes[0].set_title(f"{law}: max {np.abs(error).max():.2f} deg")
 

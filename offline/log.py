@@ -62,6 +62,7 @@ class Log:
         attachments: name -> bytes.
         metadata: name -> text pairs.
         problems: what is damaged or missing, one line each; empty for a whole file.
+        finished: the recorder ended the file itself.
     """
 
     path: Path
@@ -71,6 +72,7 @@ class Log:
     attachments: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
+    finished: bool = True
 
     def __getitem__(self, channel: str) -> Records:
         """All messages of a channel, (n,), fields by name; empty when none was logged. Raises BadFile on no such channel."""
@@ -142,18 +144,6 @@ def open_log(path: Path | str) -> Log:
         raise BadFile(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-def find_log(run: Path | str) -> Path:
-    """The log of a run: the file itself, or the one `.mcap` in its directory. Raises BadFile when there is none or several."""
-    path = Path(run)
-    if not path.is_dir():
-        return path
-    found = sorted(path.glob("*.mcap"))
-    if len(found) != 1:
-        names = ", ".join(f.name for f in found) or "none"
-        raise BadFile(f"{path}: a run's directory holds one .mcap log; here: {names}")
-    return found[0]
-
-
 class _Reader:
     """The state of one reading."""
 
@@ -200,6 +190,7 @@ class _Reader:
     def _say_what_is_cut(self, records: FileRecords, size: int) -> None:
         for start, end in records.skipped:
             self._problem(f"{end - start} bytes from byte {start} on are no records, left out")
+        self.log.finished = records.finished
         if not records.finished:
             left = size - records.at
             self._problem(f"the file was not finished or is cut off: it can be read up to byte {records.at}, {left} bytes follow")

@@ -93,7 +93,7 @@ def check_log(log: Log) -> LogCheck:
         windows=_windows(gaps),
         problems=list(log.problems),
         ends_s=max((h.last_s for h in held), default=0.0),
-        finished=not any("not finished" in problem for problem in log.problems),
+        finished=log.finished,
     )
 
 

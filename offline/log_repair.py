@@ -20,6 +20,7 @@ from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 from softloop.offline.log import DAMAGE, decompress, find_messages
 from softloop.offline.mcap_walk import RECORD, FileRecords
 from softloop.wire.errors import BadFile, Unavailable
+from softloop.wire.log_parts import parts_of
 from softloop.wire.mcap_chunks import MAGIC, ChunkedWriter
 from softloop.wire.mcap_layout import CHUNK_BYTES, LIBRARY, PROFILE
 
@@ -38,34 +39,50 @@ class Repaired:
 
 
 def repair_log(source: Path, target: Path | None = None) -> Repaired:
-    """Write what can be read of `source` into a whole file.
+    """Write what can be read of `source`, and of the parts after it, into one whole file.
 
     Args:
-        target: where to; None: in place of `source`, which is then kept beside it with `.damaged` at its end.
+        source: the log, or its first part.
+        target: where to; None: in place of `source`; it and its parts are then kept beside it with `.damaged` at their ends.
 
     Raises:
-        BadFile: `source` is no MCAP file, or cannot be read.
+        BadFile: `source` is no MCAP file, or cannot be read; of several parts: none is.
         Unavailable: `target` is there already, or cannot be written.
     """
-    kept = source.with_name(source.name + KEPT_AS)
-    taken = kept if target is None else target
-    if taken.exists():
+    parts = parts_of(source)
+    kept = [part.with_name(part.name + KEPT_AS) for part in parts]
+    taken = next((file for file in (kept if target is None else [target]) if file.exists()), None)
+    if taken is not None:
         raise Unavailable(f"{taken}: is there already; move it away first")
     made = (source if target is None else target).with_name((target or source).name + ".partial")
-    content = _read(source)
+    contents, unread = _read_all(parts)
     try:
         with made.open("wb") as stream:
-            found = _rewrite(content, stream, target or source)
+            found = _rewrite(contents, stream, target or source)
+            found.left_out += unread
             stream.flush()
             os.fsync(stream.fileno())
-        if target is None:
-            source.rename(kept)
+        for part, name in zip(parts, kept if target is None else [], strict=False):
+            part.rename(name)
         made.rename(target or source)
     except OSError as error:
         with suppress(OSError):
             made.unlink()
         raise Unavailable(f"{made}: cannot be written: {error.strerror or error}") from None
     return found
+
+
+def _read_all(parts: list[Path]) -> tuple[list[memoryview], int]:
+    """What can be read of the parts, and how many cannot. Raises BadFile when none can."""
+    contents, unread = [], []
+    for part in parts:
+        try:
+            contents.append(_read(part))
+        except BadFile as error:  # a recorder that was killed in its first moment
+            unread.append(error)
+    if not contents:
+        raise unread[0]
+    return contents, len(unread)
 
 
 def _read(source: Path) -> memoryview:
@@ -79,13 +96,19 @@ def _read(source: Path) -> memoryview:
     return memoryview(mapped)
 
 
-def _rewrite(content: memoryview, stream: Any, file: Path) -> Repaired:
-    described = _Descriptions()
-    _each(content, described.handlers)
-    rewriter = _Rewriter(stream, file, described)
-    rewriter.found.left_out = _each(content, rewriter.handlers) + len(rewriter.lost_channels)
-    rewriter.writer.finish()
-    return rewriter.found
+def _rewrite(contents: list[memoryview], stream: Any, file: Path) -> Repaired:
+    rewriter: _Rewriter | None = None
+    found = Repaired(file)
+    for content in contents:
+        described = _Descriptions()
+        _each(content, described.handlers)
+        if rewriter is None:
+            rewriter = _Rewriter(stream, found, described.header)
+        rewriter.take_descriptions(described)
+        found.left_out += _each(content, rewriter.handlers) + len(rewriter.lost_channels)
+    if rewriter is not None:
+        rewriter.writer.finish()
+    return found
 
 
 def _each(content: memoryview, handlers: dict[int, Callable[[bytes], None]]) -> int:
@@ -139,28 +162,45 @@ class _Descriptions:
 
 
 class _Rewriter:
-    """The state of one repair. Numbers of schemas and channels are given anew."""
+    """The state of one repair. Numbers of schemas and channels are given anew, equal ones of several parts the same."""
 
-    def __init__(self, stream: Any, file: Path, described: _Descriptions) -> None:
-        self.found = Repaired(file)
+    def __init__(self, stream: Any, found: Repaired, header: Header) -> None:
+        self.found = found
         self.lost_channels: set[int] = set()
-        self.writer = ChunkedWriter(stream, described.header.profile, described.header.library, CHUNK_BYTES)
+        self.writer = ChunkedWriter(stream, header.profile, header.library, CHUNK_BYTES)
         self._attached: set[str] = set()
         self._described: set[str] = set()
-        schemas = {0: 0}
-        for number, schema in described.schemas.items():
-            schemas[number] = self.writer.add_schema(schema.name, schema.encoding, schema.data)
-        self._channels = {
-            number: self.writer.add_channel(channel.topic, channel.message_encoding, schemas[channel.schema_id])
-            for number, channel in described.channels.items()
-            if channel.schema_id in schemas
-        }
+        self._channels: dict[int, int] = {}
+        self._schema_numbers: dict[tuple[str, str, bytes], int] = {}
+        self._channel_numbers: dict[tuple[str, str, int], int] = {}
         self.handlers: dict[int, Callable[[bytes], None]] = {
             Opcode.CHUNK: self._chunk,
             Opcode.MESSAGE: self._message,
             Opcode.ATTACHMENT: self._attachment,
             Opcode.METADATA: self._metadata,
         }
+
+    def take_descriptions(self, described: _Descriptions) -> None:
+        """Begin the next part: what its numbers of schemas and channels mean."""
+        self.lost_channels = set()
+        schemas = {0: 0} | {number: self._schema_number(schema) for number, schema in described.schemas.items()}
+        self._channels = {
+            number: self._channel_number(channel, schemas[channel.schema_id])
+            for number, channel in described.channels.items()
+            if channel.schema_id in schemas
+        }
+
+    def _schema_number(self, schema: Schema) -> int:
+        key = (schema.name, schema.encoding, bytes(schema.data))
+        if key not in self._schema_numbers:
+            self._schema_numbers[key] = self.writer.add_schema(schema.name, schema.encoding, schema.data)
+        return self._schema_numbers[key]
+
+    def _channel_number(self, channel: Channel, schema: int) -> int:
+        key = (channel.topic, channel.message_encoding, schema)
+        if key not in self._channel_numbers:
+            self._channel_numbers[key] = self.writer.add_channel(channel.topic, channel.message_encoding, schema)
+        return self._channel_numbers[key]
 
     def _attachment(self, body: bytes) -> None:
         attachment = Attachment.read(_stream(body))

@@ -31,7 +31,7 @@ from softloop.controller.tick import SCRATCH_TYPE, controller_tick
 from softloop.dynamics.parameters import MODEL_TYPE, Parameters
 from softloop.offline.log import Log, Records
 from softloop.offline.replay_log import BEGIN, RECALL, LoggedRun, Stretch, read_run
-from softloop.wire.benchfile import load_model
+from softloop.wire.benchfile import T, load_model
 from softloop.wire.errors import BadConfig, BadFile
 from softloop.wire.kernel import array_of, kernel
 from softloop.wire.mcap_layout import git_state, versions
@@ -257,6 +257,11 @@ def logged_controller(log: Log) -> ControllerConfig:
     if not isinstance(content, dict):
         raise BadFile(f"{log.path}: its bench file has no table [controller]: nothing to replay")
     return load_model(ControllerConfig, content, f"{log.path}: bench.toml, [controller]")
+
+
+def logged_table(log: Log, name: str, kind: type[T]) -> T:
+    """A table of the bench file attached to a log, with its defaults where it is not there. Raises BadFile or BadConfig."""
+    return load_model(kind, _attached(log, "bench.toml").get(name, {}), f"{log.path}: bench.toml, [{name}]")
 
 
 def logged_parameters(log: Log) -> Parameters:

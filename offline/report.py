@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from softloop.offline.figures import PICTURES
-from softloop.offline.log import Log, find_log, open_log
+from softloop.offline.log import Log
 from softloop.offline.page import document, picture, text
+from softloop.offline.run_log import find_log, open_run
 from softloop.offline.summary import MEANINGS, shown, table_rows, write_summary
 from softloop.offline.vector import FORMATS, as_bytes, write
 
@@ -26,7 +27,7 @@ def make_report(run: Path | str, log: Log | None = None, summary: dict[str, Any]
         BadFile: there is no log, or nothing can be written there.
     """
     path = find_log(run)
-    log = log if log is not None else open_log(path)
+    log = log if log is not None else open_run(path)
     summary = summary if summary is not None else write_summary(path, log)
     folder = path.parent
     pictures = []

@@ -11,17 +11,18 @@ import numpy as np
 from rich.table import Table
 
 from softloop.offline import metrics
-from softloop.offline.log import Log, find_log, open_log
+from softloop.offline.log import Log
 from softloop.offline.metrics import SENSORS, TO_BUS, TOTAL, dwells, spread, tracked
+from softloop.offline.run_log import find_log, open_run
 from softloop.wire.channels import CHANNELS
 from softloop.wire.errors import BadFile
+from softloop.wire.log_parts import account_of, parts_of
 from softloop.wire.messages import constant, names_of
 
 SUMMARY = "summary.json"
 # Which process, by its table in the bench file, speaks on a steady channel.
 SPOKEN_BY = {"pressure": "pressures", "inclination": "inclinometer", "command": "controller", "cycle": "controller"}
 SPOKEN_BY |= {"valves": "valves", "truth": "plant"}
-ACCOUNT = "recorder.json"
 LATE_MAX_MS = 2.0  # a plant that was behind the clock by more simulated another rig than the one that it stands for
 Value = float | int | str | bool | None
 Paper = dict[str, tuple[float, float | None]]
@@ -220,8 +221,8 @@ def write_summary(run: Path | str, log: Log | None = None) -> dict[str, Value]:
     Raises BadFile when there is no log, or the summary cannot be written.
     """
     path = find_log(run)
-    found = summarise(log if log is not None else open_log(path))
-    found["recorder_dropped"] = _dropped(path.parent / ACCOUNT)
+    found = summarise(log if log is not None else open_run(path))
+    found["recorder_dropped"] = _dropped([account_of(part) for part in parts_of(path)])
     target = path.parent / SUMMARY
     try:
         target.write_text(json.dumps(found, indent=2, allow_nan=False) + "\n", encoding="utf-8")
@@ -230,10 +231,11 @@ def write_summary(run: Path | str, log: Log | None = None) -> dict[str, Value]:
     return found
 
 
-def _dropped(account: Path) -> int | None:
+def _dropped(accounts: list[Path]) -> int | None:
+    """What all recorders of a run dropped; None where one of them left no account."""
     try:
-        content = json.loads(account.read_text(encoding="utf-8"))
-        return sum(int(content[key]) for key in ("dropped_backlog", "dropped_storage", "malformed"))
+        contents = [json.loads(account.read_text(encoding="utf-8")) for account in accounts]
+        return sum(int(content[key]) for content in contents for key in ("dropped_backlog", "dropped_storage", "malformed"))
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

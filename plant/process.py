@@ -13,6 +13,7 @@ import numpy as np
 from softloop.plant.config import PlantProcess
 from softloop.plant.electrical import next_event_ns, run_until
 from softloop.plant.faults import begin_faults
+from softloop.plant.injection import Injection
 from softloop.plant.records import EVENT, EVENT_DRIVER, EVENT_FAULT, EVENT_LOAD, EVENT_TRUTH
 from softloop.plant.setup import PERIOD_NS, WireTimes, new_device, new_state, plant_record
 from softloop.plant.wires import CanSide, Outbox, SerialSide
@@ -51,6 +52,7 @@ class Plant:
         self._put_truth = context.wire.publisher(TRUTH)
         self._status = StatusReporter(context, SOURCE)
         self._reporter = EventReporter(context, SOURCE)
+        self._injection = Injection(context)
         self._late_max_ns = self._misses = 0
         self.start()
 
@@ -69,6 +71,7 @@ class Plant:
     def turn(self) -> None:
         """Read, update, write, keep time."""
         self._can.take_commands(self._params, self._state)
+        self._injection.take(self._params, self._state)
         late_ns = max(self._let_happen(self._clock.now_ns()), self._send_due(self._clock.now_ns()))
         self._late_max_ns = max(self._late_max_ns, late_ns)
         self._misses += late_ns > LATE_NS

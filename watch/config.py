@@ -1,7 +1,8 @@
-"""`[recorder]`, `[page]` and `[foxglove]` of the bench file."""
+"""`[recorder]`, `[monitor]`, `[page]` and `[foxglove]` of the bench file."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from ipaddress import ip_address
 
 from pydantic import Field, model_validator
@@ -19,6 +20,48 @@ class RecorderConfig(Table):
     backlog_messages: int = Field(100_000, ge=1, le=10_000_000, description="messages waiting; beyond it the oldest go")
     unwritten_mib: int = Field(64, ge=1, le=4096, description="bytes the disk did not take yet; beyond it new messages go")
     drain_s: float = Field(3.0, ge=0, le=60, description="time allowed at the end for what is still waiting")
+
+
+class MonitorConfig(Table):
+    """`[monitor]`: the invariants that a process watches at wall pace, and whether it faults the gate when one does not hold."""
+
+    faults_gate: bool = Field(False, description="an invariant that does not hold leads the gate to FAULT, reason `invariant`")
+    parameters: bool = Field(True, description="watch that every estimate is inside its set")
+    command: bool = Field(True, description="watch that both currents are within saturation")
+    error: bool = Field(True, description="watch the error on the trajectory; not with law pressure")
+    error_max_deg: float = Field(30.0, gt=0, le=360, description="its envelope, either way")
+    error_s: float = Field(0.1, ge=0, le=60, description="for how long it must be left")
+    chatter: bool = Field(True, description="watch the changes of the working mode")
+    switches_per_s: float = Field(80.0, gt=0, le=200, description="more of them within one second are chattering")
+    bound: bool = Field(True, description="watch Eq. 50's ultimate bound where its assumptions hold; laws arc and smc")
+    bound_margin: float = Field(1.5, ge=1, le=100, description="times the bound: sampling and delays are not in its proof")
+    poll_s: float = Field(0.005, gt=0, le=1, description="how often arrived records are judged")
+
+
+@dataclass(frozen=True)
+class LawGains:
+    """What Eq. 50's bound of a law follows from; see the law's table."""
+
+    k1: float
+    k2: float
+    rho: float
+    epsilon1: float
+    epsilon2: float
+    desired_max_kpa: float
+
+
+@dataclass(frozen=True)
+class MonitorProcess:
+    """What the monitor is given: its table, and what it must know of the controller.
+
+    Attributes:
+        parameters: the controller's parameter file. law: gains of a law that Eq. 50 speaks of. angle: it follows an angle.
+    """
+
+    table: MonitorConfig
+    parameters: str
+    law: LawGains | None = None
+    angle: bool = True
 
 
 class PageConfig(Table):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softloop.wire.channels import CAN, CYCLE, EVENT, PRESSURE, STATUS, VALVES, WATERMARK, Channel, channel_of_key
-from softloop.wire.messages import BadPayload, message
+from softloop.wire.messages import BadPayload, constant, message
 
 RATE_WINDOW_S = 2.0
 LATE_TICKS = 12_000  # a minute
 RECENT_TICKS = 2_000  # ten seconds
 LATE_EDGES_US = np.concatenate([[0.0], np.geomspace(10.0, 100_000.0, 25), [np.inf]])  # six bins a decade, 10 us to 100 ms
+_PLANT, _KIND_FAULT = constant("Event", "SOURCE_PLANT"), constant("Event", "KIND_FAULT")
+_STARTING = constant("ProcessStatus", "STATE_STARTING")
 _KEPT = {CYCLE.name, VALVES.name, PRESSURE.name}
 FrameTime = Callable[[int, int], int]  # data bytes, bit/s -> ns on the bus
 
@@ -84,6 +86,7 @@ class Overview:
         newest: channel name -> its newest message; `cycle`, `valves` and `pressure` are short for these, or None.
         statuses: process -> (newest `ProcessStatus`, when it came).
         events: the newest events, oldest first.
+        broken: Event FAULT_* -> how many such faults stand in the rig, by its events since it began.
         cycles: the cycle records of the last `take`.
     """
 
@@ -100,6 +103,7 @@ class Overview:
         self.statuses: dict[str, tuple[Any, float]] = {}
         self.events: deque[Any] = deque(maxlen=events_kept)
         self.events_seen = 0
+        self.broken: Counter[int] = Counter()
         self.cycles: list[Any] = []
         self.malformed = 0
 
@@ -152,9 +156,16 @@ class Overview:
         elif lane.channel is STATUS:
             name = self._processes.get(unpacked.process, f"process {unpacked.process}")
             self.statuses[name] = (unpacked, now_s)
+            if unpacked.process == _PLANT and unpacked.state == _STARTING:
+                self.broken.clear()
         elif lane.channel is EVENT:
-            self.events.append(unpacked)
-            self.events_seen += 1
+            self._note_event(unpacked)
+
+    def _note_event(self, event: Any) -> None:
+        self.events.append(event)
+        self.events_seen += 1
+        if event.kind == _KIND_FAULT:
+            self.broken[event.reason] = max(0, self.broken[event.reason] + (1 if event.code else -1))
 
     def _note_frame(self, name: str, frame: Any) -> None:
         bus = self.buses.get(name)

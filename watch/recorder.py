@@ -8,7 +8,7 @@ What it drops, it counts, by these rules:
   their schema cannot be read by others;
 - unknown: a key that is no channel of the table.
 The first two are events in the log; the first three stand in `ProcessStatus.dropped`. At the end `recorder.json` in the run's
-directory says it all.
+directory says it all. A recorder that is started again in a run writes the log's next part, `run-2.mcap` and `recorder-2.json`.
 """
 
 from __future__ import annotations
@@ -24,12 +24,19 @@ from softloop.watch.config import RecorderConfig
 from softloop.wire.backlog import Backlog
 from softloop.wire.channels import CAN, EVENT, STATUS, Channel
 from softloop.wire.errors import Unavailable
-from softloop.wire.mcap_layout import BadMessage, LogWriter, attachments_of, known_channel, read_origin, topic_of_key
+from softloop.wire.log_parts import account_of, next_part
+from softloop.wire.mcap_layout import (
+    BadMessage,
+    LogWriter,
+    attachments_of,
+    known_channel,
+    read_origin,
+    topic_of_key,
+)
 from softloop.wire.messages import constant, message
 from softloop.wire.shell import Context, say
 
 NAME = "recorder"
-ACCOUNT = "recorder.json"
 SOURCE = constant("Event", "SOURCE_RECORDER")
 KIND_BACKLOG = constant("Event", "KIND_BACKLOG")
 CODE_BACKLOG = 0  # Event.code with KIND_BACKLOG: the recorder did not keep up
@@ -168,7 +175,8 @@ class Recorder:
         self.context = context
         self.account = Account()
         self.inbox: Backlog = context.wire.everything(config.backlog_messages)
-        self.sink = Sink(context.run_dir / config.file)
+        self.file = next_part(context.run_dir / config.file)
+        self.sink = Sink(self.file)
         origin = read_origin(context.bench, context.clock.now_ns())
         attachments = attachments_of(context.run_dir)
         self.log = LogWriter(self.sink, origin, attachments, config.chunk_kib * 1024)
@@ -240,7 +248,7 @@ class Recorder:
 
     def _storage_lost(self, text: str) -> None:
         self.account.storage_errors.append(text)
-        say(NAME, f"{self.config.file}: {text}; the run goes on, and up to {self.config.unwritten_mib} MiB wait for the disk")
+        say(NAME, f"{self.file.name}: {text}; the run goes on, and up to {self.config.unwritten_mib} MiB wait for the disk")
         self._event(CODE_STORAGE, self.account.storage)
 
     def listen_again(self) -> None:
@@ -315,10 +323,11 @@ class Recorder:
 
     def _leave_account(self, *, finished: bool) -> None:
         text = json.dumps(self.account.as_dict(self.sink.stored, finished=finished), indent=2)
+        file = account_of(self.file)
         try:
-            (self.context.run_dir / ACCOUNT).write_text(text + "\n")
+            file.write_text(text + "\n")
         except OSError as error:
-            say(NAME, f"{ACCOUNT}: {error.strerror or error}")
+            say(NAME, f"{file.name}: {error.strerror or error}")
 
 
 def run(config: RecorderConfig, context: Context) -> None:

@@ -43,6 +43,9 @@ CAN = Channel("can", "CanFrame", 600.0, realtime=True)  # key: can/<bus>/<arbitr
 
 CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, EVENT, CYCLE, TRUTH, STATUS, CAN)
 
+# Asked for and answered, not published (`wire.questions`): a fault for the simulated rig, answered by the plant alone.
+FAULT = Channel("fault", "FaultRequest", 0.0, logged=False)
+
 # Lockstep pace alone, and on keys of their own, which nobody hears who does not ask for them. Of the priority of what they
 # speak of, so that on a link neither overtakes the other.
 PACE_ROOT = "softloop-pace"

@@ -155,7 +155,8 @@ def cdr_corpus():
     good = kind.make(
         seq=5000, pressure_stamp_ns=near, inclination_stamp_ns=near, angle_deg=70.0, charge_current_ma=100.0, ready=1
     )
-    return [kind.pack(good)] + [k.pack(k.make(seq=1, stamp_ns=1)) for k in _KINDS]
+    ones = [k.make(**{name: 1 for name in ("seq", "stamp_ns") if name in k.Tuple._fields}) for k in _KINDS]
+    return [kind.pack(good)] + [k.pack(one) for k, one in zip(_KINDS, ones, strict=True)]
 
 
 def one_line(read, file):

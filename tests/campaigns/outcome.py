@@ -24,6 +24,9 @@ class Outcome:
     def count(self, what, n=1):
         self.counts[what] = self.counts.get(what, 0) + n
 
+    def keep_largest(self, what, n):
+        self.counts[what] = max(self.counts.get(what, 0), round(n))
+
     def fail(self, text):
         self.failures.append(text)
 

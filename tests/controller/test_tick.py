@@ -14,22 +14,30 @@ from softloop.controller.setup import PERIOD_NS, build
 MS = 1_000_000
 
 
-def fed(controller, tick, armed=True, angle=26.75, pressure=0.5, age_ns=3 * MS, status=0):
+def fed(controller, tick, armed=True, angle=26.75, pressure=0.5, age_ns=3 * MS, status=0, rate=0.0):
     inputs = controller.inputs[0]
     inputs.now_ns, inputs.tick, inputs.skipped = 10**9 + tick * PERIOD_NS, tick, 0
     inputs.pressure.seq = inputs.inclination.seq = inputs.valves.seq = tick + 1
     inputs.pressure.stamp_ns = inputs.inclination.stamp_ns = inputs.now_ns - age_ns
     inputs.pressure.supply_pressure_kpa, inputs.pressure.chamber_pressure_kpa = 200.0, pressure
     inputs.pressure.status = status
-    inputs.inclination.angle_deg, inputs.inclination.rate_deg_s = angle, 0.0
+    inputs.inclination.angle_deg, inputs.inclination.rate_deg_s = angle, rate
     inputs.valves.gate = r.GATE_ARMED if armed else 0
     return controller.tick()
 
 
+def built(law):
+    return build(ControllerConfig(law=law, trajectory="excitation_1hz" if law == "pressure" else "t1", approach_s=0.05))
+
+
 @pytest.fixture(params=["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure"])
-def controller(request):
-    trajectory = "excitation_1hz" if request.param == "pressure" else "t1"
-    return build(ControllerConfig(law=request.param, trajectory=trajectory, approach_s=0.05))
+def law(request):
+    return request.param
+
+
+@pytest.fixture
+def controller(law):
+    return built(law)
 
 
 def test_it_waits_until_armed_with_valid_inputs_then_approaches_tracks_and_ends(controller):
@@ -56,6 +64,41 @@ def test_a_gate_that_disarms_sends_it_back_to_wait_with_no_current(controller):
     cycle = fed(controller, 5, armed=False)
     assert cycle.phase == r.PHASE_WAIT
     assert cycle.charge_current_ma == cycle.exhaust_current_ma == 0.0
+
+
+def test_rearming_begins_anew_from_what_is_measured(controller, law):
+    for k in range(60):
+        fed(controller, k, angle=40.0 + 0.1 * k, pressure=30.0 + 0.2 * k)
+    for k in range(60, 63):  # the currents of two ticks count in the prediction
+        fed(controller, k, armed=False)
+    controller.state[0].theta[:] = controller.model[0].theta_max  # as if learned before the fault
+    first = fed(controller, 63, angle=55.0, pressure=20.0)
+    assert first.phase == r.PHASE_APPROACH
+    fresh = built(law)
+    fresh.state[0].last_ns = controller.inputs[0].now_ns - PERIOD_NS
+    expected = fed(fresh, 63, angle=55.0, pressure=20.0)
+    for name in (
+        "theta",
+        "charge_current_ma",
+        "exhaust_current_ma",
+        "reference_deg",
+        "internal",
+        "estimator",
+        "mode",
+        "adapting",
+    ):
+        np.testing.assert_array_equal(first[name], expected[name], err_msg=name)
+    if law != "pressure":
+        assert first.reference_deg == 55.0
+
+
+def test_a_rig_that_still_falls_is_waited_for(controller):
+    for k in range(10):
+        cycle = fed(controller, k, rate=-10.1)
+        assert cycle.phase == r.PHASE_WAIT
+        assert cycle.charge_current_ma == cycle.exhaust_current_ma == 0.0
+    assert fed(controller, 10, rate=-9.9).phase == r.PHASE_APPROACH
+    assert fed(controller, 11, rate=-200.0).phase == r.PHASE_APPROACH
 
 
 @pytest.mark.parametrize("what", ["pressure", "inclination", "both"])

@@ -160,11 +160,23 @@ def test_shipped_benches_load_and_every_process_has_its_config(name, tmp_path):
 
 
 def test_processes_are_those_whose_tables_stand_in_the_file():
-    assert {p.name for p in processes_of(load_bench(shipped_benches()["sim"]))} == {p.name for p in PROCESSES}
+    assert {p.name for p in processes_of(load_bench(shipped_benches()["sim"]))} == {p.name for p in PROCESSES} - {"monitor"}
     real = load_bench(shipped_benches()["real"])
-    assert {p.name for p in processes_of(real)} == {p.name for p in PROCESSES} - {"plant"}
+    assert {p.name for p in processes_of(real)} == {p.name for p in PROCESSES} - {"monitor", "plant"}
     with pytest.raises(BadConfig, match="bench 'real' has no process 'plant'; it has: recorder, valves, "):
         find_process(real, "plant")
+
+
+def test_a_monitor_is_asked_for_by_its_table_and_keeps_no_step(tmp_path):
+    text = shipped_benches()["sim"].read_text() + "\n[monitor]\nfaults_gate = true\n"
+    (tmp_path / "watched.toml").write_text(text)
+    bench = load_bench(tmp_path / "watched.toml")
+    assert "monitor" in {p.name for p in processes_of(bench)}
+    given = process_config(bench, "monitor")
+    assert (given.table.faults_gate, given.parameters, given.angle) == (True, "table1", True)
+    assert (given.law.k1, given.law.epsilon1) == (bench.controller.arc.k1, bench.controller.arc.epsilon1)
+    lockstep = bench.model_copy(update={"pace": bench.pace.model_copy(update={"mode": "lockstep"})})
+    assert "monitor" not in {p.name for p in processes_of(lockstep)}
 
 
 def test_a_real_rig_differs_from_the_simulated_one_in_addresses_only():

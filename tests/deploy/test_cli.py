@@ -12,6 +12,7 @@ import pytest
 
 from softloop.deploy import cli
 from softloop.deploy.gate_requests import Requests, ask
+from softloop.deploy.launcher import Options
 from softloop.deploy.prepare import kernel_modules
 from softloop.wire.errors import EXIT_ENVIRONMENT, EXIT_INTERRUPTED, EXIT_NEGATIVE, EXIT_OK, EXIT_USAGE
 
@@ -176,6 +177,16 @@ def test_a_gate_in_fault_is_asked_to_arm_once_only(gate, sends):
     wire = FakeWire()
     assert not ask(Requests(wire), FakeState(gate), "arm", 0.55)
     assert len(wire.sent) == sends
+
+
+def test_what_is_asked_of_a_run_reaches_the_launcher(monkeypatch):
+    taken = []
+    monkeypatch.setattr("softloop.deploy.launcher.launch", lambda bench, options: taken.append(options) or 0)
+    words = ["run", "sim", "--duration", "3", "--pace", "lockstep", "--run-dir", "there", "--no-report", "--quiet", "--page"]
+    with pytest.raises(SystemExit):
+        cli.main([*words, "--foxglove"])
+    asked = {"duration_s": 3.0, "pace": "lockstep", "run_dir": Path("there"), "report": False, "quiet": True}
+    assert taken == [Options(**asked, page=True, foxglove=True)]
 
 
 def test_every_kernel_module_is_warmed():

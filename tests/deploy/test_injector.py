@@ -11,6 +11,7 @@ import pytest
 
 from softloop.deploy.children import Child
 from softloop.deploy.injector import Injector
+from softloop.deploy.launcher_events import LauncherEvents
 from softloop.wire.fault_config import FaultsConfig, InjectionConfig
 from softloop.wire.messages import constant, message, names_of
 
@@ -42,7 +43,7 @@ class Rig:
         bench = SimpleNamespace(
             faults=FaultsConfig(injections=(InjectionConfig(at_s=0.0, **injection),)), recorder=SimpleNamespace(file="run.mcap")
         )
-        self.injector = Injector(bench, tmp_path, wire, children, self.started.append)
+        self.injector = Injector(bench, tmp_path, LauncherEvents(wire), children, self.started.append)
 
     def act(self, armed=True):
         if armed and not self.state.armed:

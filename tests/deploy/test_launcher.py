@@ -4,6 +4,7 @@ import shutil
 import sys
 import tempfile
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,11 @@ from softloop.deploy.bench import load_bench
 from softloop.deploy.children import Children
 from softloop.deploy.launcher import Launch
 from softloop.deploy.live import PlainView
+from softloop.deploy.node import processes_of
 from softloop.deploy.router import launcher_wire
 from softloop.deploy.run_dir import bench_lock, keep_bench
 from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, Unavailable
-from softloop.wire.session import open_router, open_wire
+from softloop.wire.session import Wire, open_router, open_wire
 from softloop.wire.shell import Stop
 
 TOY = (sys.executable, str(Path(__file__).with_name("toy_node.py")))
@@ -53,11 +55,18 @@ class Said(PlainView):
         self.lines.append(line)
 
 
-def launch(run_dir, wrong, stop=None, **changes):
+def wait_for(condition, timeout_s=10.0):
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
+
+
+def launch(run_dir, wrong, stop=None, more="", **changes):
     """Run the toy bench; returns how it ended, what was said and the children."""
     file = run_dir / "toy.toml"
     limits = LIMITS | changes
-    file.write_text(BENCH + "[run]\n" + "".join(f"{key} = {value}\n" for key, value in limits.items()))
+    file.write_text(BENCH + more + "[run]\n" + "".join(f"{key} = {value}\n" for key, value in limits.items()))
     (run_dir / "toy.json").write_text(json.dumps(wrong))
     bench = load_bench(file, run_dir)
     keep_bench(run_dir, bench)
@@ -99,6 +108,31 @@ def test_a_process_that_dies_while_running_is_lost_and_named(short_dir, name):
     outcome, _, _ = launch(short_dir, {"controller": "endless"} | {name: "dies_armed"})
     assert outcome.code == EXIT_LOST
     assert f"process '{name}' ended with code 7" in outcome.text
+
+
+def test_a_recorder_that_dies_is_started_again_and_the_run_goes_on(short_dir):
+    wrong = {"controller": "endless", "recorder": "dies_once"}
+    outcome, lines, children = launch(short_dir, wrong, more="[recorder]\n", duration_s=6.0)
+    assert (outcome.code, outcome.text) == (EXIT_OK, "ended after 6 s as asked")
+    assert "process 'recorder' ended with code 7" in "\n".join(lines)
+    assert "process 'recorder' is back" in lines
+    events = [line for line in lines if line.startswith("launcher: recorder")]
+    assert events[0] == "launcher: recorder was lost"
+    assert events[1].startswith("launcher: recorder is back after ")
+    assert children.all["recorder"].exit_code() == 0
+
+
+def test_a_recorder_that_cannot_start_ends_the_run(short_dir):
+    outcome, _, _ = launch(short_dir, {"recorder": "dies"}, more="[recorder]\n")
+    assert outcome.code == 3
+    assert "the cable is out" in outcome.text
+
+
+@pytest.mark.parametrize("order", [reversed, lambda names: names[2:] + names[:2]])
+def test_the_order_of_starting_does_not_matter(short_dir, monkeypatch, order):
+    monkeypatch.setattr("softloop.deploy.launcher.processes_of", lambda bench: tuple(order(processes_of(bench))))
+    outcome, _, _ = launch(short_dir, {}, more="[recorder]\n")
+    assert outcome.code == EXIT_OK, outcome.text
 
 
 def test_a_gate_fault_ends_the_run_with_its_reason(short_dir):
@@ -145,10 +179,13 @@ def test_a_shared_meeting_point_must_be_there_and_know_nobody_of_the_bench(short
     bench = load_bench(file, short_dir)
     with pytest.raises(Unavailable, match="no router at "), launcher_wire(bench):
         pass
-    with open_router(bench.zenoh, bench.name):
+    with open_router(bench.zenoh, bench.name) as session:
+        meeting = Wire(session, bench.name, "router")
         with open_wire(bench.zenoh, bench.name, "plant") as plant:
             plant.declare_alive()
+            wait_for(lambda: meeting.processes_alive() == {"plant"})
             with pytest.raises(Unavailable, match=r"bench 'toy' is running already at .*m\.sock: plant"), launcher_wire(bench):
                 pass
+        wait_for(lambda: not meeting.processes_alive())
         with launcher_wire(bench) as wire:
             assert wire.processes_alive() == {"launcher"}

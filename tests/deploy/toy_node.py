@@ -2,7 +2,8 @@
 
     toy_node.py node NAME BENCH --run-dir DIR --lifeline-fd N
 
-What a process does wrong stands in DIR/toy.json: name -> one of `dies`, `dies_armed`, `faults`, `hangs_armed`, `mute`, `deaf`.
+What a process does wrong stands in DIR/toy.json: name -> one of
+`dies`, `dies_armed`, `dies_once`, `faults`, `hangs_armed`, `mute`, `deaf`.
 """
 
 import json
@@ -57,6 +58,7 @@ class Idle:
         self.wire, self.clock, self.wrong = context.wire, context.clock, wrong
         self.valves = self.wire.latest(VALVES)
         self.status = self.wire.publisher(STATUS)
+        self.mark = context.run_dir / "died_once"
         self.armed_ns = 0
         self.seq = 0
 
@@ -66,6 +68,9 @@ class Idle:
         if payload and message("ValveStatus").unpack(payload).gate == ARMED and not self.armed_ns:
             self.armed_ns = self.clock.now_ns()
         if self.armed_ns and self.wrong == "dies_armed":
+            os._exit(7)
+        if self.armed_ns and self.wrong == "dies_once" and not self.mark.exists():
+            self.mark.touch()
             os._exit(7)
 
 

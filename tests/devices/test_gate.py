@@ -53,7 +53,9 @@ FAULTS = [
     (g.REASON_CONTROLLER_LOST, {"command_seq": 1}),
     (g.REASON_BUS_OFF, {"bus_off": 1}),
     (g.REASON_DRIVER_SILENT, {"driver": g.DRIVER_WATCHDOG}),
-    (g.REASON_EMERGENCY_STOP, {"stop": 1}),
+    (g.REASON_EMERGENCY_STOP, {"stop": g.STOP_ASKED}),
+    (g.REASON_EMERGENCY_STOP, {"stop": g.STOP_ASKED | g.STOP_INVARIANT}),
+    (g.REASON_INVARIANT, {"stop": g.STOP_INVARIANT}),
 ]
 
 

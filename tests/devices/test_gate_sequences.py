@@ -11,6 +11,7 @@ from tests.devices.gate_bench import GateBench
 from tests.devices.test_gate import FAULTS
 
 MS = 1_000_000
+CONDITIONS = [fault for fault in FAULTS if "stop" not in fault[1]]
 ANYTHING = st.fixed_dictionaries(
     {},
     optional={
@@ -27,7 +28,7 @@ ANYTHING = st.fixed_dictionaries(
         "ready": st.integers(0, 1),
         "bus_off": st.integers(0, 1),
         "driver": st.sampled_from([g.DRIVER_OK, g.DRIVER_WATCHDOG, g.DRIVER_SILENT]),
-        "stop": st.integers(0, 1),
+        "stop": st.integers(0, 3),
         "disarm": st.integers(0, 1),
         "shutdown": st.integers(0, 1),
     },
@@ -104,15 +105,15 @@ class GateMachine(RuleBasedStateMachine):
         self.step(disarm=1)
         self.armed = False
 
-    @rule(fault=st.sampled_from(FAULTS[:-1]))
+    @rule(fault=st.sampled_from(CONDITIONS))
     def condition(self, fault):
         self.step(**fault[1])
         self.latched |= self.armed
         self.armed = False
 
-    @rule()
-    def stop(self):
-        self.step(stop=1)
+    @rule(asked=st.integers(1, 3))
+    def stop(self, asked):
+        self.step(stop=asked)
         self.armed, self.latched = False, True
 
     @rule(fault=st.sampled_from(FAULTS))

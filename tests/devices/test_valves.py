@@ -101,6 +101,14 @@ def test_it_arms_passes_currents_and_faults_on_stop(rig):
     rig.until(lambda: rig.events.find(kind=KIND_GATE, code=g.GATE_FAULT, reason=g.REASON_EMERGENCY_STOP))
 
 
+def test_the_monitors_request_is_a_fault_of_its_own_reason(rig):
+    rig.arm()
+    rig.until(lambda: rig.frames[-1].output == g.OUTPUT_PASS)
+    rig.request(constant("GateRequest", "ACTION_FAULT"))
+    rig.until(lambda: rig.frames[-1].output == g.OUTPUT_VENT)
+    rig.until(lambda: rig.events.find(kind=KIND_GATE, code=g.GATE_FAULT, reason=g.REASON_INVARIANT))
+
+
 def test_each_frame_has_its_status_and_the_counters_go_on(rig):
     rig.arm()
     for _ in range(100):

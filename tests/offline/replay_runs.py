@@ -23,7 +23,7 @@ MS = 1_000_000
 START_NS = synthetic.START_CLOCK_NS + 100 * MS
 APPROACH_S = 0.3
 CONFIGS = {
-    "pid": ControllerConfig(law="pid", trajectory="t2", approach_s=APPROACH_S),
+    "pid": ControllerConfig(law="pid", trajectory="t1", approach_s=APPROACH_S),
     "arc": ControllerConfig(law="arc", trajectory="t2", approach_s=APPROACH_S),
     "pressure": ControllerConfig(law="pressure", trajectory="excitation_1hz", approach_s=APPROACH_S),
 }

@@ -7,7 +7,8 @@ import pytest
 import synthetic
 from rich.console import Console
 
-from softloop.offline.log import find_log, open_log
+from softloop.offline.log import open_log
+from softloop.offline.run_log import find_log
 from softloop.offline.summary import MEANINGS, summarise, summary_table, write_summary
 from softloop.wire.errors import BadFile
 

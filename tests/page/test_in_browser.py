@@ -7,6 +7,10 @@ import time
 import numpy as np
 import pytest
 
+from softloop.deploy.fault_requests import offer_faults
+from softloop.plant.fault_request import FaultRequest, unpack_request
+from softloop.wire.channels import FAULT
+from softloop.wire.questions import Questions
 from tests.page.browsing import LIVE, LOST, PHONE, viewing, wait_for
 from tests.watch.benches import speaking, write_bench
 from tests.watch.pages import served, toy_rig, until
@@ -208,3 +212,37 @@ def test_experiments_are_started_and_ended_from_the_page(chromium):
                 view.click("#end")
                 until(lambda: "end" in asked)
     assert asked[0] == {"law": "pid", "trajectory": "t2", "duration_s": 12}
+
+
+def test_faults_can_be_asked_of_a_simulated_plant_alone(chromium):
+    with short_folder() as folder:
+        file = write_bench(folder, f"faulty-{os.getpid()}")
+        with speaking(file) as speaker, toy_rig(speaker), served(file) as (site, address):
+            offer_faults(site)
+            with viewing(chromium, address, allow=("400",)) as view:
+                wait_for(view, "document.getElementById('fault-state').textContent === 'no simulated plant is running here'")
+                assert view.locator("#inject").is_disabled()
+                assert view.locator("#mend").is_disabled()
+                plant = Questions(speaker.wire, FAULT)
+                speaker.say("status", seq=1, pid=77, process=3, state=1)
+                view.wait_for_selector("#inject:enabled")
+                assert view.locator("#fault-form [name=size]").is_enabled()
+                view.select_option("#fault-form [name=kind]", "supply_loss")
+                assert view.locator("#fault-unit").inner_text() == "part"
+                view.fill("#fault-form [name=size]", "2")
+                view.click("#inject")
+                wait_for(view, "document.getElementById('answer').textContent.includes('out of range')")
+                view.select_option("#fault-form [name=kind]", "angle_stuck")
+                assert view.locator("#fault-form [name=size]").is_disabled()
+                view.fill("#fault-form [name=duration_s]", "1.5")
+                speaker.say("status", seq=2, pid=77, process=3, state=1)
+                view.click("#inject")
+                asked = []
+                until(lambda: asked.extend(plant.take_all()) or asked)
+                assert unpack_request(asked[0].payload) == FaultRequest(kind="angle_stuck", duration_s=1.5)
+                asked[0].refuse("not at lockstep pace")
+                wait_for(view, "document.getElementById('answer').textContent === 'Not done: not at lockstep pace'")
+                speaker.say("event", source=3, kind=8, code=1, reason=6)
+                speaker.say("status", seq=3, pid=77, process=3, state=1)
+                wait_for(view, "document.getElementById('fault-state').textContent === 'broken: angle stuck'")
+                assert "fault angle_stuck came" in view.locator("#events").inner_text()

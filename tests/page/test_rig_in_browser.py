@@ -40,7 +40,7 @@ def test_what_the_page_shows_is_logged_and_its_stop_vents(chromium, request, tmp
             rows = np.array(view.evaluate(ALL_KEPT))
             start_ns = view.evaluate("softloop.state.start_ns")
             if shots:
-                view.screenshot(path=Path(shots) / "page.png")
+                view.screenshot(path=Path(shots) / "page.png", full_page=True)
             box = view.locator("#stop").bounding_box()
             view.mouse.move(box["x"] + 20, box["y"] + 20)
             view.evaluate("document.addEventListener('pointerdown', (e) => { window.clickedAt = e.timeStamp; }, true)")
@@ -60,6 +60,33 @@ def test_what_the_page_shows_is_logged_and_its_stop_vents(chromium, request, tmp
     asked_ms = (clicked_ns - asked_ns) / MS
     print(f"from the click to the first vent frame: {vented_ms:.1f} ms; the test had asked for it {asked_ms:.1f} ms before")
     assert 0 < vented_ms < LIMIT_MS
+
+
+def test_a_fault_from_the_page_is_shown_and_logged_and_the_gate_reacts(chromium, tmp_path):
+    waves_csv(tmp_path / "waves.csv")
+    text = f'base = "{shipped_benches()["sim"]}"\n[page]\nport = 0\n{WIDE}[controller]\ntrajectory = "{tmp_path}/waves.csv"\n'
+    with running(text, name="faulty-rig", arguments=("--page", "--no-report")) as rig:
+        with viewing(chromium, address_of(rig), allow=LOST) as view:
+            wait_for(view, "softloop.state && softloop.state.phase === 'track'")
+            view.select_option("#fault-form [name=kind]", "noise")
+            view.fill("#fault-form [name=size]", "1")
+            view.click("#inject")
+            wait_for(view, "document.getElementById('fault-state').textContent === 'broken: noise'")
+            view.click("#mend")
+            wait_for(view, "document.getElementById('fault-state').textContent === 'nothing is broken'")
+            assert view.evaluate("softloop.state.gate.state") == "armed"
+            view.select_option("#fault-form [name=kind]", "inclinometer_silent")
+            view.click("#inject")
+            wait_for(view, "document.getElementById('events').textContent.includes('fault inclinometer_silent came')")
+            wait_for(view, "document.getElementById('events').textContent.includes('gate fault (')")
+            assert rig.finish() == 1
+        log = open_log(rig.run_dir / "run.mcap")
+    events = log["event"]
+    came = events[(events["kind"] == constant("Event", "KIND_FAULT")) & (events["source"] == constant("Event", "SOURCE_PLANT"))]
+    noise, silent = constant("Event", "FAULT_NOISE"), constant("Event", "FAULT_INCLINOMETER_SILENT")
+    assert [(int(e["code"]), int(e["reason"])) for e in came] == [(1, noise), (0, noise), (1, silent)]
+    gate = events[(events["kind"] == constant("Event", "KIND_GATE")) & (events["code"] == GATE_FAULT)]
+    assert 0 < (gate["stamp_ns"][0] - came["stamp_ns"][-1]) / MS < 1000.0
 
 
 def waves_csv(target):

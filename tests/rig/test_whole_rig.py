@@ -12,6 +12,7 @@ from mcap_ros2.decoder import DecoderFactory
 from softloop.deploy.bench import shipped_benches
 from softloop.offline.log import open_log
 from softloop.offline.metrics import truth_errors, while_armed
+from softloop.offline.run_log import open_run
 from softloop.wire.channels import CHANNELS
 from softloop.wire.messages import constant
 from tests.rig.rigs import running
@@ -75,11 +76,12 @@ def test_it_starts_vented_at_rest_and_ends_vented(short_bench):
         assert truth["charge_coil_ma"][-1] < 1.0
 
 
-def test_ctrl_c_vents_and_ends(short_bench):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_sigterm_vent_and_end(short_bench, number):
     with running(short_bench, name="ctrl-c") as rig:
         rig.wait_for_word(ARMED)
         time.sleep(2.5)
-        rig.signal(signal.SIGINT)
+        rig.signal(number)
         assert rig.finish() == 130
         assert rig.left_over() == []
         truth = open_log(rig.run_dir / "run.mcap")["truth"]
@@ -99,7 +101,7 @@ def test_a_killed_launcher_takes_all_with_it_and_the_gate_vents_first(short_benc
         assert last["charge_current_ma"] == 0.0
 
 
-@pytest.mark.parametrize("victim", ["controller", "inclinometer", "valves"])
+@pytest.mark.parametrize("victim", ["controller", "pressures", "inclinometer", "valves"])
 def test_a_killed_process_of_the_control_path_ends_in_a_vent_and_is_named(short_bench, victim):
     with running(short_bench, name="lost") as rig:
         rig.wait_for_word(ARMED)
@@ -107,9 +109,36 @@ def test_a_killed_process_of_the_control_path_ends_in_a_vent_and_is_named(short_
         rig.named(victim).kill()
         assert rig.finish() in (1, 4)
         assert victim in rig.output
-        truth = open_log(rig.run_dir / "run.mcap")["truth"]
+        log = open_log(rig.run_dir / "run.mcap")
+        truth = log["truth"]
         assert truth["charge_coil_ma"][-1] < 1.0
         assert truth["chamber_pressure_kpa"][-1] < 10.0
+        if victim != "valves":
+            assert constant("ValveStatus", "GATE_FAULT") in log["valves"]["gate"]
+
+
+def test_a_killed_recorder_comes_back_with_a_part_of_its_own_and_the_run_goes_on(short_bench):
+    # A trajectory so long that a busy machine has started the recorder before its end.
+    with running(short_bench.replace("approach_s = 2.0", "approach_s = 60.0"), name="reborn") as rig:
+        rig.wait_for_word(ARMED)
+        time.sleep(1.0)
+        rig.named("recorder").kill()
+        rig.wait_for_word("recorder is back")
+        time.sleep(1.0)
+        rig.signal(signal.SIGINT)
+        assert rig.finish() == 130, rig.output + rig.logs()
+        assert rig.left_over() == []
+        parts = [open_log(rig.run_dir / name) for name in ("run.mcap", "run-2.mcap")]
+        assert [part.finished for part in parts] == [False, True]
+        log = open_run(rig.run_dir)
+        assert len(parts[1]["cycle"]) > 100
+        assert constant("ValveStatus", "GATE_FAULT") not in log["valves"]["gate"]
+        assert (np.diff(log["cycle"]["seq"].astype(int)) >= 1).all()
+        events = log["event"][log["event"]["source"] == constant("Event", "SOURCE_LAUNCHER")]
+        back = events[events["kind"] == constant("Event", "KIND_PROCESS")][-1]
+        assert (back["code"], back["reason"]) == (1, constant("Event", "SOURCE_RECORDER"))
+        assert 0.5 <= back["value"] < 60.0
+        assert not rig.summary()["evidence_valid"]
 
 
 def test_a_stopped_recorder_does_not_hold_the_loop(short_bench):
@@ -176,3 +205,21 @@ def test_a_can_channel_nobody_answers_on_is_said_and_nothing_arms(short_bench):
         assert "driver" in rig.output
         truth = open_log(rig.run_dir / "run.mcap")["truth"]
         assert truth["charge_coil_ma"].max() < 1.0
+
+
+def test_the_monitor_is_silent_on_a_good_run_and_can_fault_the_gate(short_bench):
+    source = constant("Event", "SOURCE_MONITOR")
+    with running(short_bench.replace("[controller]", "[monitor]\nfaults_gate = true\n[controller]"), name="watched") as rig:
+        assert rig.finish() == 0, rig.output + rig.logs()
+        log = open_log(rig.run_dir / "run.mcap")
+        assert source in log["status"]["process"]
+        assert source not in log["event"]["source"]
+    strict = "[monitor]\nfaults_gate = true\nerror_max_deg = 0.001\nerror_s = 0.01\n[controller]"
+    with running(short_bench.replace("[controller]", strict), name="strict") as rig:
+        assert rig.finish() == 1
+        assert "the gate went to FAULT: invariant" in rig.output
+        log = open_log(rig.run_dir / "run.mcap")
+        events = log["event"][log["event"]["source"] == source]
+        assert events["code"][0] == constant("Event", "INVARIANT_ERROR")
+        gate = log["event"][log["event"]["reason"] == constant("ValveStatus", "REASON_INVARIANT")]
+        assert 0 <= gate["stamp_ns"][0] - events["stamp_ns"][0] < 1_000_000_000

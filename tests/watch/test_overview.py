@@ -71,3 +71,15 @@ def test_a_status_goes_by_the_name_of_its_process_and_rubbish_is_counted():
     assert seen.malformed == 1
     seen.take([("softloop/other/cycle", b"x"), ("softloop/b/nothing", b"x")], 3.0)
     assert len(seen.lanes) == 2
+
+
+def test_what_is_broken_is_known_until_it_leaves_or_the_rig_begins_anew():
+    seen = overview()
+    fault = {"source": 3, "kind": 8, "reason": 7}
+    for code, standing in ((1, {7: 1}), (1, {7: 2}), (0, {7: 1}), (0, {}), (0, {}), (1, {7: 1})):
+        seen.take([(key(BENCH, EVENT), made("Event", code=code, **fault))], 1.0)
+        assert +seen.broken == standing
+    seen.take([(key(BENCH, STATUS), made("ProcessStatus", process=3, state=1))], 2.0)
+    assert +seen.broken == {7: 1}
+    seen.take([(key(BENCH, STATUS), made("ProcessStatus", process=3, state=0))], 2.0)
+    assert +seen.broken == {}

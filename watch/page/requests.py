@@ -27,9 +27,14 @@ STOP_FOR_S = 0.5
 
 
 class Requester:
-    """One who asks: a random name on the wire, and a count."""
+    """One who asks: a random name on the wire, and a count.
+
+    Attributes:
+        wire: by which it asks.
+    """
 
     def __init__(self, wire: Wire) -> None:
+        self.wire = wire
         self._publisher = wire.declare_publisher(key(wire.bench, REQUEST), realtime=True)
         self._origin = secrets.randbits(63)
         self._seq = 0

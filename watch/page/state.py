@@ -20,6 +20,7 @@ _REASONS = names_of("ValveStatus", "REASON_")
 _DRIVERS = names_of("ValveStatus", "DRIVER_")
 _PHASES = names_of("CycleRecord", "PHASE_")
 _MODES = names_of("ValveCommand", "MODE_")
+_FAULTS = names_of("Event", "FAULT_")
 _STATES = names_of("ProcessStatus", "STATE_")
 _NUMBERS = (
     "angle_deg", "rate_deg_s", "reference_deg", "error_deg", "chamber_pressure_kpa", "supply_pressure_kpa",
@@ -55,6 +56,7 @@ def state_of(overview: Overview, now_s: float | None = None) -> dict[str, Any]:
         "processes": _processes(overview, now_s),
         "buses": {name: round(bus.load_percent, 2) for name, bus in overview.buses.items()},
         "rates": _rates(overview),
+        "broken": [_FAULTS.get(number, "?") for number, count in sorted(overview.broken.items()) if count],
         "late": {"counts": overview.lateness_histogram(), **overview.lateness_spread_us()},
     }
     if valves is not None:

@@ -63,7 +63,7 @@ function greet(hello) {
   page.charts = new Charts($("plots"), page.store, hello.columns);
   page.panels = new Panels(hello);
   experiments(hello);
-  $("faults").hidden = !hello.actions?.includes("fault");
+  faults(hello);
 }
 
 function update(state) {
@@ -81,6 +81,7 @@ function update(state) {
   page.dirty = heard;
   answered(gate);
   experimentState(state.experiment);
+  faultState(state);
 }
 
 // ---- the emergency stop: on press, three ways at once, until the gate says FAULT
@@ -172,6 +173,55 @@ $("experiment-form").addEventListener("submit", async (event) => {
   say(answer.error ? `Not started: ${answer.error}` : "");
 });
 $("end").addEventListener("click", async () => { const answer = await post("/action/end"); say(answer.error ?? ""); });
+
+// ---- faults, of a simulated rig alone
+
+function faults(hello) {
+  $("faults").hidden = !hello.actions?.includes("fault");
+  if ($("faults").hidden) return;
+  $("fault-form").elements.kind.replaceChildren(...hello.faults.map(({ kind }) => {
+    const option = make("option", "", kind.replaceAll("_", " "));
+    option.value = kind;
+    return option;
+  }));
+  faultState(null);
+}
+
+function faultState(state) {
+  if ($("faults").hidden) return;
+  const form = $("fault-form").elements;
+  const plant = Boolean(state?.running && state.processes.some((p) => p.name === "plant" && p.heard_s < 2.5));
+  const unit = page.hello.faults.find(({ kind }) => kind === form.kind.value)?.unit ?? "";
+  for (const element of form) element.disabled = !plant;
+  form.size.disabled = !plant || !unit;
+  form.size.required = plant && Boolean(unit);
+  form.size.placeholder = unit ? "" : "has none";
+  $("fault-unit").textContent = unit;
+  const broken = plant ? state.broken : [];
+  $("mend").disabled = !broken.length;
+  $("fault-state").classList.toggle("broken", broken.length > 0);
+  const whole = plant ? "nothing is broken" : "no simulated plant is running here";
+  $("fault-state").textContent = broken.length ? `broken: ${broken.join(", ").replaceAll("_", " ")}` : whole;
+}
+
+async function askPlant(asked) {
+  try {
+    const answer = await post("/action/fault", asked);
+    say(answer.error ? `Not done: ${answer.error}` : "");
+  } catch {
+    say("The request did not reach the server.");
+  }
+}
+
+$("fault-form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  const { kind, size, duration_s: duration } = event.target.elements;
+  const asked = { action: "break", kind: kind.value, duration_s: Number(duration.value) || 0 };
+  if (!size.disabled) asked.size = Number(size.value);
+  askPlant(asked);
+});
+$("fault-form").elements.kind.addEventListener("change", () => faultState(page.state));
+$("mend").addEventListener("click", () => askPlant({ action: "mend" }));
 
 // ---- time shown, pause, keys
 

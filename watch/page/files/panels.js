@@ -44,7 +44,7 @@ export class Panels {
       track.title = `${name}: ${min.toPrecision(4)} to ${max.toPrecision(4)}, from the file ${value.toPrecision(4)}`;
       track.style.setProperty("--start", `${place01(value, min, max) * 100}%`);
       track.append(mark);
-      place.append(label, track, shown);
+      place.append(label, make("span", "bound", bound(min)), track, make("span", "bound high", bound(max)), shown);
       return { mark, shown, min, max };
     });
   }
@@ -128,6 +128,11 @@ export class Panels {
 export function showLaw({ law, trajectory }) {
   text("law", [law, trajectory && trajectory.split("/").pop()].filter(Boolean).join(" on "));
   $("law").title = trajectory || "";
+}
+
+// A bound in few characters: 0.062, 3e-7.
+function bound(value) {
+  return Number(value.toPrecision(2)).toString();
 }
 
 function place01(value, min, max) {
