@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import socket
 import subprocess
+import sys
+import tempfile
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,12 +18,17 @@ from rich.console import Console
 from softloop.deploy.bench import Bench, find_bench, load_bench
 from softloop.deploy.children import PROGRAM
 from softloop.deploy.doctor_check import Check, worst
+from softloop.deploy.doctor_clock import clock, clock_source, day_error_ms
 from softloop.deploy.doctor_devices import devices, is_real
 from softloop.deploy.doctor_host import disk, existing, lateness, library_versions, permissions, zenoh
+from softloop.deploy.launcher import stop_on_signals
+from softloop.deploy.prepare import prepare_in_child
+from softloop.deploy.progress import compile_progress
 from softloop.deploy.router import launcher_wire
-from softloop.deploy.run_dir import bench_lock
+from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench
 from softloop.wire.clock import WallClock
-from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, Unavailable
+from softloop.wire.config import PaceConfig
+from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, Interrupted, SoftloopError, Unavailable
 from softloop.wire.mcap_layout import read_origin, versions
 
 CHILD_SLACK_S = 40.0
@@ -32,10 +40,12 @@ def doctor(bench_file: Path, seconds: float, certificate: Path | None, *, as_jso
     Raises:
         BadFile, BadConfig: the bench file is wrong.
         Unavailable: the bench is running: a machine is examined at rest; or the certificate cannot be written.
+        Interrupted: by a person, while kernels were compiled.
     """
-    bench = load_bench(find_bench(bench_file))
-    with bench_lock(bench.name):
-        checks = examine(bench, bench_file, seconds)
+    file = find_bench(bench_file)
+    bench = load_bench(file)
+    with bench_lock(bench.name), tempfile.TemporaryDirectory(prefix="softloop-") as folder:
+        checks = examine(file, Path(folder), seconds)
     answer = certified(bench, checks)
     if certificate is not None:
         _write(certificate, answer)
@@ -43,12 +53,41 @@ def doctor(bench_file: Path, seconds: float, certificate: Path | None, *, as_jso
     return EXIT_NEGATIVE if answer["verdict"] == "fail" else EXIT_OK
 
 
-def examine(bench: Bench, bench_file: Path, seconds: float) -> list[Check]:
-    """All checks, in the order in which they matter to a person. Raises Unavailable when the bench is running."""
-    with launcher_wire(bench) as wire, Console(stderr=True).status("listening to the machine and the devices"):
-        seen = _measure_in_child(bench_file, seconds)
-        checks = [*timing(bench, seen), *devices(bench, wire, seconds)]
-    return [*checks, *disk(bench, existing(Path(bench.run.folder))), library_versions()]
+def examine(bench_file: Path, run_dir: Path, seconds: float) -> list[Check]:
+    """All checks, in the order in which they matter to a person.
+
+    Args:
+        run_dir: an empty folder, what `{run_dir}` of the bench file becomes.
+
+    Raises:
+        Unavailable: the bench is running. Interrupted: as `doctor`.
+    """
+    bench = load_bench(bench_file, run_dir)
+    bench = bench.model_copy(update={"pace": PaceConfig()})  # devices are listened to at wall pace
+    keep_bench(run_dir, bench)
+    checks = [prepared(run_dir)]
+    with launcher_wire(bench) as wire, _shown("listening to the machine"):
+        checks += timing(bench, _measure_in_child(run_dir / BENCH_FILE, seconds))
+        checks += devices(bench, run_dir, wire, seconds)
+    folder = existing(Path(bench.run.folder))
+    return [*checks, clock(clock_source(), day_error_ms()), *disk(bench, folder), library_versions()]
+
+
+def _shown(what: str) -> AbstractContextManager[Any]:
+    return Console(stderr=True).status(what) if sys.stderr.isatty() else nullcontext()
+
+
+def prepared(run_dir: Path) -> Check:
+    """The bench in `run_dir` made ready as for a run: kernels compiled, parameters and trajectory good. Raises Interrupted."""
+    try:
+        with stop_on_signals() as stop, compile_progress(quiet=False) as progress:
+            ready = prepare_in_child(run_dir / BENCH_FILE, run_dir, stop, progress)
+    except Interrupted:
+        raise
+    except SoftloopError as error:
+        return Check("bench", "fail", str(error), "mend the bench file: `softloop check` says the same")
+    found = f"kernels of {ready.kernel_modules} modules, trajectory {ready.trajectory_s:.1f} s"
+    return Check("bench", "pass", found, "", {"kernel_modules": ready.kernel_modules, "trajectory_s": ready.trajectory_s})
 
 
 def timing(bench: Bench, seen: dict[str, Any] | str) -> list[Check]:
