@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from softloop.deploy.bench import Bench
 from softloop.deploy.doctor_check import Check, Verdict, judged, worst
@@ -153,7 +154,7 @@ def driver(bench: Bench, heard: Heard) -> Check:
     name = "valve driver at rest"
     receiver = can_frames.E2eReceiver(can_frames.VALVE_STATUS_ID, bench.valves.driver_max_lost)
     good = [data for data in heard.status if receiver.judge(data).usable]
-    measured = {"frames": len(heard.status), "refused": receiver.rejected, "commanded": heard.commanded}
+    measured: dict[str, Any] = {"frames": len(heard.status), "refused": receiver.rejected, "commanded": heard.commanded}
     if not good:
         return Check(name, "fail", "none of its frames has a right counter and CRC", "see rig.dbc: E2E profile 1", measured)
     if heard.commanded:
