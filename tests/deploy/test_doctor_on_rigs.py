@@ -169,19 +169,19 @@ def test_devices_that_are_not_there(place):
 
 def test_bytes_that_are_no_samples(place):
     """A listener at the wrong baud rate sees bytes and no packets: here, a device that says nonsense."""
-    read_end, write_end = os.openpty()
+    device_end, host_end = os.openpty()
     try:
         place.file.write_text(
-            f'name = "examined"\n[host]\nrealtime_priority = 0\n[inclinometer]\nport = "{os.ttyname(write_end)}"\n'
+            f'name = "examined"\n[host]\nrealtime_priority = 0\n[inclinometer]\nport = "{os.ttyname(host_end)}"\n'
         )
-        with subprocess.Popen([sys.executable, "-c", NONSENSE], stdout=read_end) as speaker:
+        with subprocess.Popen([sys.executable, "-c", NONSENSE], stdout=device_end) as speaker:
             _, found = place.checks()
             speaker.kill()
         assert found["inclinometer"]["verdict"] == "fail"
         assert "no samples" in found["inclinometer"]["found"]
     finally:
-        os.close(read_end)
-        os.close(write_end)
+        os.close(device_end)
+        os.close(host_end)
 
 
 NONSENSE = "import sys, time\nwhile True: sys.stdout.buffer.write(bytes(range(1, 50))); sys.stdout.flush(); time.sleep(0.01)"
@@ -220,8 +220,7 @@ def test_mistakes_are_one_line(place):
     done = place.doctor()
     assert (done.returncode, done.stderr.count("\n"), done.stdout) == (2, 1, "")
     place.write('certificate = "/no/such/file"\n')
-    command = [sys.executable, "-m", "softloop.deploy.cli", "run", str(place.file), "--run-dir", str(place.folder / "r")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=place.environment)
+    done = place.softloop("run", str(place.file), "--run-dir", str(place.folder / "r"))
     assert (done.returncode, done.stderr) == (2, "softloop: /no/such/file: cannot be read: No such file or directory\n")
 
 
