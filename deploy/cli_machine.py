@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from softloop.deploy.cli_app import BenchArgument, app
+from softloop.deploy.cli_app import BenchArgument, app, log_app
 from softloop.wire.errors import EXIT_OK
 
 
@@ -35,3 +35,15 @@ def doctor_ticks(bench: BenchArgument, seconds: Annotated[float, typer.Option(me
 
     measure_as_child(load_bench(find_bench(bench)), seconds)
     return EXIT_OK
+
+
+@log_app.command("prune")
+def log_prune(
+    bench: BenchArgument,
+    budget: Annotated[int | None, typer.Option(metavar="MIB", min=0, help="Instead of [recorder] budget_mib.")] = None,
+    dry: Annotated[bool, typer.Option("--dry-run", help="Say what would go, and remove nothing.")] = False,
+) -> int:
+    """Remove a bench's oldest runs until the rest fits its disk budget; never one in use, or one that holds a file `keep`."""
+    from softloop.deploy.rotate import prune
+
+    return prune(bench, budget, dry=dry)

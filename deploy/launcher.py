@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ from softloop.deploy.node import KEPT_PROCESSES, STOP_ORDER, processes_of
 from softloop.deploy.prepare import prepare_in_child
 from softloop.deploy.progress import compile_progress
 from softloop.deploy.rig_state import GATE_FAULT, RigState
+from softloop.deploy.rotate import in_use, keeping_budget, make_room
 from softloop.deploy.router import launcher_wire, remove_sockets
 from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench, keep_certificate, make_run_dir
 from softloop.wire.channels import HELLO
@@ -72,21 +73,25 @@ def launch(bench_file: Path, options: Options, then: Callable[..., int] = _concl
 
     Raises:
         BadFile, BadConfig: the bench file is wrong, or its trajectory not feasible.
-        Unavailable: the bench runs already, its address is in use, or the run directory cannot be made.
+        Unavailable: the bench runs already, its address is in use, its disk budget is used up, or the run directory cannot
+            be made.
     """
     bench = _with_options(load_bench(bench_file), options)
     if not processes_of(bench):
         raise BadConfig(f"{bench_file}: no process to run: it has none of the tables plant, valves, controller, ...")
-    with stop_on_signals() as stop, bench_lock(bench.name):
+    with stop_on_signals() as stop, bench_lock(bench.name), ExitStack() as held:
+        make_room(bench)
         run_dir = make_run_dir(bench, options.run_dir)
         bench = _with_options(load_bench(bench_file, run_dir), options)
         keep_bench(run_dir, bench)
+        held.enter_context(in_use(run_dir))
         keep_certificate(run_dir, bench)
         with compile_progress(quiet=options.quiet) as progress:
             prepared = prepare_in_child(run_dir / BENCH_FILE, run_dir, stop, progress)
         with (
             launcher_wire(bench) as wire,
             closing(make_view(prepared.trajectory_s, quiet=options.quiet)) as view,
+            keeping_budget(bench, view.say),
             beside(onlookers(run_dir, options), run_dir, view.say) as viewers,
         ):
             kind = Launch if bench.pace.mode == "wall" else LockstepLaunch
