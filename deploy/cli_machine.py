@@ -47,3 +47,24 @@ def log_prune(
     from softloop.deploy.rotate import prune
 
     return prune(bench, budget, dry=dry)
+
+
+@app.command()
+def install(
+    to: Annotated[Path, typer.Option(metavar="DIR", help="Where the units go.")] = Path("/etc/systemd/system"),
+    user: Annotated[str, typer.Option(metavar="NAME", help="Who runs them; a user and a group of that name.")] = "softloop",
+    benches: Annotated[Path, typer.Option(metavar="DIR", help="The folder of bench files: NAME.toml for softloop@NAME.")] = Path(
+        "/etc/softloop"
+    ),
+    cpus: Annotated[str, typer.Option(metavar="LIST", help="Cores for the rig, such as 2-3. Default: all.")] = "",
+    program: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The command softloop. Default: that of this installation.")
+    ] = None,
+    network: Annotated[bool, typer.Option("--network", help="Allow addresses off this machine.")] = False,
+) -> int:
+    """Write systemd units: a run of a bench, its router, its viewers, each a template by bench."""
+    from softloop.deploy.install import install as write_units
+    from softloop.deploy.install import own_program
+    from softloop.deploy.services import Setting
+
+    return write_units(to, Setting(program or own_program(), user, benches, cpus, network))
