@@ -20,6 +20,8 @@ from packaging.version import Version
 
 from softloop.deploy.bench import Bench
 from softloop.deploy.doctor_check import Check, Verdict, judged, worst
+from softloop.deploy.rotate import MIB, RunFolder, runs_of
+from softloop.watch.config import RecorderConfig
 from softloop.wire.channels import CHANNELS
 from softloop.wire.mcap_layout import versions
 from softloop.wire.messages import message
@@ -32,6 +34,7 @@ DRIFT_FACTOR, DRIFT_US = 1.5, 200.0  # from the first third to the last, in the 
 RT_GUARD = Path("/proc/sys/kernel/sched_rt_runtime_us")
 RECORD_BYTES = 31  # what MCAP adds to a message
 WRITES, WRITE_BYTES, WRITES_AT_MOST_S = 40, 256 * 1024, 10.0
+BUDGET_WARN = 0.9
 FULL_MIN, TIGHT_MIN = 10.0, 60.0  # minutes of log for which there is room: less fails, less warns
 SEE = "see docs/real-time.md"
 
@@ -158,7 +161,8 @@ def disk(bench: Bench, folder: Path) -> list[Check]:
         free = shutil.disk_usage(folder).free
     except OSError as error:
         return [Check("disk stalls", "fail", f"{folder}: {error.strerror or error}", "make [run] folder writable for this user")]
-    return [_stalls(bench, folder, stalls_s), _room(folder, free)]
+    budget = [_budget(bench.recorder, runs_of(bench))] if bench.recorder.budget_mib else []
+    return [_stalls(bench, folder, stalls_s), _room(folder, free), *budget]
 
 
 def write_stalls(folder: Path) -> list[float]:
@@ -194,6 +198,17 @@ def _room(folder: Path, free: int) -> Check:
     found = f"{folder}: {free / 1e9:.1f} GB free, room for {minutes / 60.0:.1f} h of log before compression"
     do = "make room: `softloop log prune`, or another [run] folder"
     return Check("disk space", verdict, found, "" if verdict == "pass" else do, {"free_bytes": free, "minutes": minutes})
+
+
+def _budget(config: RecorderConfig, runs: Sequence[RunFolder]) -> Check:
+    """What is left of `[recorder] budget_mib`: a run is refused above it, unless older ones may go."""
+    used = sum(run.n_bytes for run in runs) / MIB
+    found = f"{len(runs)} runs hold {used:.0f} MiB of {config.budget_mib}"
+    measured = {"runs": len(runs), "used_mib": used, "budget_mib": config.budget_mib}
+    if config.over_budget == "remove" or used <= BUDGET_WARN * config.budget_mib:
+        return Check("disk budget", "pass", found, "", measured)
+    verdict: Verdict = "fail" if used > config.budget_mib else "warn"
+    return Check("disk budget", verdict, found, 'make room: `softloop log prune`; or over_budget = "remove"', measured)
 
 
 def existing(folder: Path) -> Path:

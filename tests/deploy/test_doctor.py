@@ -12,9 +12,11 @@ from softloop.deploy.doctor_check import Check, judged, worst
 from softloop.deploy.doctor_clock import clock, clock_source, day_error_ms
 from softloop.deploy.doctor_devices import bus_is_simulated, inclinometer_is_simulated, is_real
 from softloop.deploy.doctor_inclinometer import _nothing_usable, judge_samples
+from softloop.deploy.rotate import MIB, RunFolder
 from softloop.deploy.run_dir import CERTIFICATE_FILE, keep_certificate, read_certificate
 from softloop.devices.protocols import can_frames, wt931
 from softloop.devices.protocols.quantise import kpa_to_counts
+from softloop.watch.config import RecorderConfig
 from softloop.wire.errors import BadConfig, BadFile
 from softloop.wire.mcap_layout import attachments_of
 
@@ -110,6 +112,15 @@ def test_room_for_the_log(bench, tmp_path):
     assert verdicts == ["pass", "warn", "warn", "fail", "fail"]
     assert [c.verdict for c in doctor_host.disk(bench(), tmp_path / "gone")] == ["fail"]
     assert doctor_host.existing(tmp_path / "a" / "b") == tmp_path
+
+
+def test_what_is_left_of_the_budget(tmp_path):
+    def verdict(used_mib, over_budget="refuse"):
+        config = RecorderConfig(budget_mib=100, over_budget=over_budget)
+        return doctor_host._budget(config, [RunFolder(tmp_path, int(used_mib * MIB), 0)]).verdict
+
+    assert [verdict(used) for used in (0, 90, 91, 100, 101)] == ["pass", "pass", "warn", "warn", "fail"]
+    assert verdict(101, "remove") == "pass"
 
 
 def test_stalls_against_what_the_recorder_bears(bench, tmp_path):

@@ -31,9 +31,9 @@ class Examined:
         self.file = folder / "b.toml"
         self.environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "TMPDIR": str(folder)}
 
-    def write(self, text):
-        """The shipped simulated bench, with `text` in its table [run] and after."""
-        head = f'base = "{shipped_benches()["sim"]}"\nname = "examined"\n{WIDE}[run]\nfolder = "{self.folder}/runs"\n'
+    def write(self, text, base="sim"):
+        """A shipped simulated bench, with `text` in its table [run] and after."""
+        head = f'base = "{shipped_benches()[base]}"\nname = "examined"\n{WIDE}[run]\nfolder = "{self.folder}/runs"\n'
         self.file.write_text(f"{head}{text}")
 
     def doctor(self, *arguments, around=()):
@@ -108,6 +108,15 @@ def test_a_whole_simulated_rig_has_no_device_that_fails_and_leaves_nothing(place
     assert {"real-time priority", "clock", "disk stalls", "disk space", "versions"} <= set(found)
     assert [name for name in place.left() if name not in ("certificate.json", "softloop-examined.lock")] == []
     _goes_into_the_log(place, certificate)
+
+
+def test_adapters_on_pseudo_terminals_are_heard_as_they_are_on_a_desk(place):
+    place.write("", base="slcan")
+    _, found = place.checks()
+    assert found["CAN valve_bus"]["measured"]["rates_hz"] == {"valve driver": pytest.approx(200, rel=0.1)}
+    assert found["CAN analog_bus"]["measured"]["rates_hz"] == {"analogue module": pytest.approx(200, rel=0.1)}
+    assert found["valve driver at rest"]["verdict"] == "pass"
+    assert found["pressures at rest"]["verdict"] == "pass"
 
 
 def _goes_into_the_log(place, certificate):
