@@ -98,7 +98,8 @@ def bars(shape: dict[str, int], width: int = 40) -> str:
     most = max(shape.values()) or 1
     ends = [*(f"to {end:>6} us" for _, end in pairwise(shape)), f"from {EDGES_US[-1]} us"]
     return "\n".join(
-        f"{end:>14} {count:>6} {'#' * -(-count * width // most)}" for end, count in zip(ends, shape.values(), strict=True)
+        f"{end:>14} {count:>6} {'#' * -(-count * width // most)}".rstrip()
+        for end, count in zip(ends, shape.values(), strict=True)
     )
 
 

@@ -16,6 +16,7 @@ from softloop.wire.errors import Lost, Unavailable
 
 NAME = "inclinometer"
 WAIT_S = 0.05
+PASSED_OVER_S = 0.2
 ENOUGH = 3  # samples, for a rate and a gap
 
 
@@ -51,15 +52,20 @@ def _nothing_usable(config: InclinometerConfig, n_bytes: int) -> Check:
 def hear_samples(
     source: SerialSource, sampler: wt931.Sampler, clock: Clock, seconds: float
 ) -> tuple[list[wt931.Sample], int, int]:
-    """(samples, packets thrown away, bytes) of `seconds`; what waited at the start is passed over. Raises Lost."""
-    sampler.feed(source.read(WAIT_S), clock.now_ns())
-    samples: list[wt931.Sample] = []
+    """(samples, packets thrown away, bytes) of `seconds`; the start, in the middle of something, is passed over. Raises Lost."""
+    _feed(source, sampler, clock, PASSED_OVER_S)
     before, before_bytes = sampler.rejected, sampler.parser.taken
+    samples = _feed(source, sampler, clock, seconds)
+    return samples, sampler.rejected - before, sampler.parser.taken - before_bytes
+
+
+def _feed(source: SerialSource, sampler: wt931.Sampler, clock: Clock, seconds: float) -> list[wt931.Sample]:
+    samples: list[wt931.Sample] = []
     end_ns = clock.now_ns() + round(seconds * 1e9)
     while clock.now_ns() < end_ns:
         data = source.read(WAIT_S)
         samples += sampler.feed(data, clock.now_ns()) if data else []
-    return samples, sampler.rejected - before, sampler.parser.taken - before_bytes
+    return samples
 
 
 def judge_samples(bench: Bench, samples: list[wt931.Sample], rejected: int) -> Check:

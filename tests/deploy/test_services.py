@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-import softloop.wire
 from softloop.deploy.node import KEPT_PROCESSES
 from softloop.deploy.services import Setting, in_a_home, needed, out_of_reach, units
+from softloop.wire import errors
 from softloop.wire.config import HostConfig
 
 PROGRAM = Path(sys.executable).with_name("softloop")
@@ -187,7 +187,7 @@ print(json.dumps({
 @pytest.fixture
 def tree(tmp_path):
     """The package as files without links, which nobody but root may change, and a cache folder of the unprivileged user's."""
-    source = Path(softloop.wire.__file__).resolve().parent.parent
+    source = Path(errors.__file__).resolve().parent.parent
     for room in ("wire", "devices"):
         shutil.copytree(source / room, tmp_path / "tree" / "softloop" / room, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "tree" / "softloop" / "__init__.py").touch()
