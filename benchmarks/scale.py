@@ -2,7 +2,7 @@
 
     python benchmarks/scale.py [--seconds 20] [--at-most 6] [--cores 0,1] [--json]
 
-One, two, ... rigs run side by side, each with its seven processes on T2. A rig holds 5 ms when it stayed armed for all of the time
+One, two, ... rigs run side by side, each with its seven processes on T2. A rig holds 5 ms when it stayed armed all of the time
 and left out no tick. Its run is valid evidence when, beside other things, its plant was in time too, which is a burden of the
 simulation. Costs are of the processes of all rigs and of the router, while all are armed: CPU time per second, and memory that no
 other process shares.
