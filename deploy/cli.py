@@ -30,13 +30,19 @@ def run(
         Path | None,
         typer.Option(metavar="SCENARIO.toml", help="Let things go wrong, and judge how that ends; see `softloop faults`."),
     ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="What `softloop doctor --certificate` wrote: into the log.")
+    ] = None,
 ) -> int:
     """Run a bench: start its processes, arm, watch, vent, stop, summary and report."""
     from softloop.deploy.bench import find_bench
     from softloop.deploy.launcher import Options, launch
 
     report = False if no_report else None
-    options = Options(run_dir=run_dir, duration_s=duration, report=report, quiet=quiet, pace=pace, page=page, foxglove=foxglove)
+    options = Options(
+        run_dir=run_dir, duration_s=duration, report=report, quiet=quiet, pace=pace, page=page, foxglove=foxglove,
+        certificate=certificate,
+    )  # fmt: skip
     if faults is not None:
         from softloop.deploy.faults import run_with_faults
 
@@ -294,7 +300,8 @@ def prepare(bench: BenchArgument, run_dir: RunDir) -> int:
 
 
 # After these in the list of commands; each enters itself.
-import softloop.deploy.cli_campaigns  # noqa: E402, F401
+import softloop.deploy.cli_campaigns  # noqa: E402
+import softloop.deploy.cli_machine  # noqa: E402, F401
 
 
 def main(arguments: list[str] | None = None) -> None:

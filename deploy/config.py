@@ -22,4 +22,5 @@ class RunConfig(Table):
     stop_timeout_s: float = Field(5.0, gt=0, description="a process that has not ended by then is killed")
     rig: str = Field("", max_length=80, description="which rig this is, for parameter files; default: the bench's name")
     foreign_parameters: bool = Field(False, description="run on a parameter file that was identified on another rig")
+    certificate: str = Field("", description="what `softloop doctor --certificate` wrote for this bench: it goes into the log")
     report: bool = Field(True, description="write report.html and its pictures at the end")

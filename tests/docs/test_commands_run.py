@@ -28,6 +28,7 @@ FIRST = ["run", "sim", "--page", "--run-dir", "runs/first"]
 SECOND = ["run", "pid.toml", "--run-dir", "runs/second"]
 BESIDE = ("top", "echo", "page", "foxglove", "request")
 ON_LOGS = ("plot", "report", "compare", "replay")
+ELSEWHERE = ("doctor", "install", "log")  # in tests of their own
 STANDS_FOR = {"runs/<run>": "runs/first", "runs/RUN": "runs/first", "runs/RUN_A": "runs/first", "runs/RUN_B": "runs/second"}
 # What is long in the documentation is short here: these words are added, or stand in for others.
 LESS = {
@@ -177,5 +178,5 @@ def test_on_what_is_there(place, command):
 
 def test_every_command_of_the_pages_is_among_these():
     """A new kind of command on a page is a new line here."""
-    assert {command[0] for _, command in ALL} <= {"run", "batch", "check", "faults", *BESIDE, *ON_LOGS}
+    assert {command[0] for _, command in ALL} <= {"run", "batch", "check", "faults", *BESIDE, *ON_LOGS, *ELSEWHERE}
     assert all(command in [command for _, command in ALL] for command in (FIRST, SECOND, STOP))
