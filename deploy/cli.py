@@ -17,6 +17,7 @@ from softloop.wire.errors import EXIT_LOST, EXIT_OK, EXIT_USAGE, BadConfig, Soft
 def run(
     bench: BenchArgument,
     run_dir: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/<bench>-<UTC time>.")] = None,
+    host: Annotated[str | None, typer.Option(metavar="NAME", help="Of a bench on several hosts: which of them this is.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="End after S seconds, armed.")] = None,
     no_report: Annotated[bool, typer.Option("--no-report", help="Leave out the report at the end.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False,
@@ -36,7 +37,9 @@ def run(
     from softloop.deploy.launcher import Options, launch
 
     report = False if no_report else None
-    options = Options(run_dir=run_dir, duration_s=duration, report=report, quiet=quiet, pace=pace, page=page, foxglove=foxglove)
+    options = Options(
+        run_dir=run_dir, duration_s=duration, report=report, quiet=quiet, pace=pace, page=page, foxglove=foxglove, host=host
+    )
     if faults is not None:
         from softloop.deploy.faults import run_with_faults
 
@@ -272,14 +275,21 @@ def warm(quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing
 
 
 @app.command()
-def router(bench: BenchArgument) -> int:
+def router(
+    bench: BenchArgument,
+    program: Annotated[
+        Literal["auto", "zenohd", "softloop"],
+        typer.Option("--with", help="auto: zenohd where it is installed, else softloop itself."),
+    ] = "auto",
+) -> int:
     """Be the meeting point of a bench until Ctrl-C, for benches with `[run] shared_router = true`."""
     from softloop.deploy.bench import find_bench, load_bench
     from softloop.deploy.launcher import stop_on_signals
     from softloop.deploy.router import run_router
+    from softloop.deploy.zenohd import find_zenohd
 
     with stop_on_signals() as stop:
-        run_router(load_bench(find_bench(bench)), stop)
+        run_router(load_bench(find_bench(bench)), stop, find_zenohd(program))
     return EXIT_OK
 
 

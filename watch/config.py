@@ -7,10 +7,10 @@ from ipaddress import ip_address
 
 from pydantic import Field, model_validator
 
-from softloop.wire.benchfile import Table
+from softloop.wire.benchfile import ProcessTable, Table
 
 
-class RecorderConfig(Table):
+class RecorderConfig(ProcessTable):
     """`[recorder]`: what the log keeps, and how much the recorder may hold back before it has to drop."""
 
     file: str = Field("run.mcap", pattern=r"^[A-Za-z0-9_.-]+\.mcap$", description="name of the log in the run's directory")
@@ -22,7 +22,7 @@ class RecorderConfig(Table):
     drain_s: float = Field(3.0, ge=0, le=60, description="time allowed at the end for what is still waiting")
 
 
-class MonitorConfig(Table):
+class MonitorConfig(ProcessTable):
     """`[monitor]`: the invariants that a process watches at wall pace, and whether it faults the gate when one does not hold."""
 
     faults_gate: bool = Field(False, description="an invariant that does not hold leads the gate to FAULT, reason `invariant`")

@@ -140,8 +140,11 @@ class HostClock:
 
     def listen(self, wire: Wire) -> None:
         """Follow the launcher's word from now on."""
-        handler = zenoh.handlers.Callback(lambda sample: self.take(sample.payload.to_bytes()), indirect=False)
+        handler = zenoh.handlers.Callback(self._hear, indirect=False)
         self._subscriber = wire.session.declare_subscriber(key(wire.bench, CLOCK), handler)
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        self.take(sample.payload.to_bytes())
 
     def take(self, payload: bytes) -> None:
         """A word on the channel `clock`; only that on this host counts."""
