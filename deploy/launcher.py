@@ -89,7 +89,7 @@ def launch(bench_file: Path, options: Options, then: Callable[..., int] = _concl
             closing(_fleet(bench, host, wire, same)) as fleet,
             beside(onlookers(run_dir, options), run_dir, view.say) as viewers,
         ):
-            launch = _kind(bench, fleet)(bench, run_dir, wire, view, stop, Children(), prepared.trajectory_s, fleet)
+            launch = launch_class(bench, fleet)(bench, run_dir, wire, view, stop, Children(), prepared.trajectory_s, fleet)
             outcome = launch.looking_after(viewers).run()
         return then(share_of(bench, host), run_dir, outcome, quiet=options.quiet)
 
@@ -98,7 +98,8 @@ def _fleet(bench: Bench, host: str, wire: Wire, same: int) -> Alone:
     return Fleet(bench, host, wire, same, LauncherEvents(wire).clock) if host else Alone()
 
 
-def _kind(bench: Bench, fleet: Alone) -> type[Launch]:
+def launch_class(bench: Bench, fleet: Alone) -> type[Launch]:
+    """How a bench is run here: by its pace, and by whether this host leads."""
     from softloop.deploy.host_launch import FollowLaunch  # noqa: PLC0415 - they are made of what stands here
     from softloop.deploy.lockstep_launch import LockstepLaunch  # noqa: PLC0415
 
