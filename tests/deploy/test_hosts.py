@@ -1,6 +1,7 @@
 """Hosts in the bench file: what is wrong is said in one line; who runs where, and which host leads."""
 
 import json
+import re
 import shutil
 import stat
 import sys
@@ -206,3 +207,13 @@ def short_dir():
     path = Path(tempfile.mkdtemp(prefix="sl-"))
     yield path
     shutil.rmtree(path)
+
+
+def test_the_pages_bench_is_right(tmp_path):
+    page = (Path(__file__).resolve().parents[2] / "docs" / "hosts.md").read_text()
+    (tmp_path / "sim.toml").write_text(shipped_benches()["sim"].read_text())
+    (tmp_path / "lab.toml").write_text(re.search(r"^```toml\n(.*?)^```", page, re.S | re.M)[1])
+    bench = load_bench(tmp_path / "lab.toml")
+    assert leader(bench) == "desk"
+    for host in re.findall(r"softloop run lab.toml --host (\w+)", page):
+        assert choose_host(bench, host) == host
