@@ -65,6 +65,7 @@ def node(
 def check(bench: BenchArgument) -> int:
     """Check a bench file, and that the actuator can follow its trajectory."""
     from softloop.deploy.bench import find_bench, load_bench
+    from softloop.deploy.hosts import shares
     from softloop.deploy.node import processes_of
     from softloop.deploy.prepare import check_controller, check_identity
 
@@ -72,7 +73,8 @@ def check(bench: BenchArgument) -> int:
     trajectory_s = check_controller(loaded)
     check_identity(loaded)
     names = ", ".join(p.name for p in processes_of(loaded)) or "no process"
-    print(f"{bench}: good. Bench '{loaded.name}': {names}; trajectory {trajectory_s:.1f} s")
+    where = "".join(f"; host {host}: {', '.join(processes)}" for host, processes in shares(loaded).items())
+    print(f"{bench}: good. Bench '{loaded.name}': {names}; trajectory {trajectory_s:.1f} s{where}")
     return EXIT_OK
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import zenoh
 
 from softloop.deploy.bench import Bench
-from softloop.deploy.hosts import leader, number_of, shares
+from softloop.deploy.hosts import launcher_name, leader, number_of, shares
 from softloop.deploy.node import PROCESSES, processes_of
 from softloop.wire.channels import CLOCK, HOST, host_key
 from softloop.wire.clock import Clock, WallClock
@@ -295,19 +295,15 @@ class Fleet(Alone):
         return seen is not None and seen.word.state == STOPPING
 
     def await_gone(self, processes: Collection[str], timeout_s: float) -> None:
-        elsewhere = {name for name in processes if not self.has(name)}
-        end_s = time.monotonic() + timeout_s
-        while elsewhere and time.monotonic() < end_s and self._someone_there():
-            if not elsewhere & self.wire.processes_alive(timeout_s=2 * _POLL_S):
-                return
-            time.sleep(_POLL_S)
-
-    def _someone_there(self) -> bool:
-        return any(self._is_there(host) for host in self._hosts if host != self.host)
+        self._await_none({name for name in processes if not self.has(name)}, timeout_s)
 
     def linger(self, timeout_s: float) -> None:
+        if self.leads:
+            self._await_none({launcher_name(self.bench, host) for host in self._hosts if host != self.host}, timeout_s)
+
+    def _await_none(self, names: set[str], timeout_s: float) -> None:
         end_s = time.monotonic() + timeout_s
-        while self.leads and self._someone_there() and time.monotonic() < end_s:
+        while names & self.wire.processes_alive(timeout_s=2 * _POLL_S) and time.monotonic() < end_s:
             time.sleep(_POLL_S)
 
     def close(self) -> None:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 # In the order in which they are started, as in `deploy.bench`, which cannot be imported here.
 _TABLES = ("recorder", "monitor", "plant", "valves", "pressures", "inclinometer", "controller")
 _NAME = re.compile(r"[a-z0-9_-]{1,24}")
+LAUNCHER = "launcher"
 _OF_A_RUN = ("{run_dir}", "{port}")
 
 
@@ -33,6 +34,11 @@ def shares(bench: Bench) -> dict[str, tuple[str, ...]]:
 def leader(bench: Bench) -> str:
     """The host that arms, ends the run and keeps the rig clock: that of the controller."""
     return host_of(bench, "controller")
+
+
+def launcher_name(bench: Bench, host: str) -> str:
+    """By which name the launcher of a host is known on the wire; that which leads has the name of the only one."""
+    return LAUNCHER if not host or host == leader(bench) else f"{LAUNCHER}-{host}"
 
 
 def number_of(bench: Bench, host: str) -> int:

@@ -11,14 +11,13 @@ from pathlib import Path
 import zenoh
 
 from softloop.deploy.bench import Bench
-from softloop.deploy.hosts import leader, on_host, shares
+from softloop.deploy.hosts import launcher_name, leader, on_host, shares
 from softloop.deploy.zenohd import run_zenohd
 from softloop.wire.config import ZenohConfig
 from softloop.wire.errors import Interrupted, Lost, Unavailable
 from softloop.wire.session import UNIX, Wire, open_router, open_session
 from softloop.wire.shell import Stop
 
-LAUNCHER = "launcher"
 POLL_S = 0.1
 JOIN_S = 3.0  # joining takes well under a tenth of a second
 
@@ -31,8 +30,7 @@ def launcher_wire(bench: Bench, host: str = "", stop: Stop | None = None, say: C
         Unavailable: the address is in use; or nobody is at the shared meeting point, or the bench runs there already.
         Interrupted: asked to stop while waiting for the host which leads.
     """
-    leads = host == leader(bench) if host else True
-    name = LAUNCHER if leads else f"{LAUNCHER}-{host}"
+    leads, name = not host or host == leader(bench), launcher_name(bench, host)
     config = on_host(bench, host).zenoh
     joins = bench.run.shared_router or not leads
     patience_s = bench.run.hosts_wait_s if host else JOIN_S
