@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -35,6 +36,7 @@ from softloop.wire.session import Wire
 from softloop.wire.shell import Stop
 
 POLL_S = 0.1
+_DIGITS = re.compile(r"[0-9.]+")
 # The gate speaks 200 times a second; a second of silence, far above any pause of a healthy machine, is a hung process.
 GATE_SILENT_NS = 1_000_000_000
 
@@ -243,8 +245,8 @@ class Launch:
             if not missing:
                 self.fleet.say(RUNNING)
                 return None
-            if missing != said:
-                said = missing
+            if _DIGITS.sub("", missing) != said:  # another figure alone is no news
+                said = _DIGITS.sub("", missing)
                 self.view.say(f"waiting for {missing}")
             self._refresh("waiting")
             trouble = self._trouble()
