@@ -33,7 +33,9 @@ STEP, DRIFT, UNSURE, SURE = (constant("Event", f"CLOCK_{c}") for c in ("STEP", "
 _SOURCES = {constant("Event", p.source): p.name for p in PROCESSES}
 _WORD_S = 1.0 / HOST.rate_hz
 _POLL_S = 0.05
-CLOCK_SILENT_S = 2.0
+_ASK_S = 1.0  # all answer within some ms, but for a machine that is very busy
+CLOCK_SILENT_S = 5.0
+SEEN_S = 3.0  # who was alive so lately is: a busy machine answers late
 
 Ending = tuple[int, str]  # exit code, and one line
 
@@ -117,6 +119,7 @@ class Fleet(Alone):
         self._word = (STARTING, 0, 0)
         self._seen: dict[str, Seen] = {}
         self._clocks: dict[int, SeenClock] = {}
+        self._alive_s: dict[str, float] = {}
         self._closed = threading.Event()
         self._wall = bench.pace.mode == "wall"
         self._put = wire.declare_publisher(host_key(bench.name, host), realtime=False).put
@@ -200,12 +203,18 @@ class Fleet(Alone):
         return seen is not None and time.monotonic() - seen.heard_s < self.bench.run.host_silence_s
 
     def missing(self) -> list[str]:
-        alive = self.wire.processes_alive(timeout_s=2 * _POLL_S)
+        alive = self._alive_lately()
         words: list[str] = []
         for host in self._hosts:
             if host != self.host:
                 words += self._missing_of(host, alive)
         return words
+
+    def _alive_lately(self) -> set[str]:
+        """Whose sign of life was there a moment ago."""
+        now_s = time.monotonic()
+        self._alive_s.update(dict.fromkeys(self.wire.processes_alive(timeout_s=_ASK_S), now_s))
+        return {name for name, seen_s in self._alive_s.items() if now_s - seen_s < SEEN_S}
 
     def _missing_of(self, host: str, alive: Collection[str]) -> list[str]:
         if not self._is_there(host):
@@ -303,7 +312,7 @@ class Fleet(Alone):
 
     def _await_none(self, names: set[str], timeout_s: float) -> None:
         end_s = time.monotonic() + timeout_s
-        while names & self.wire.processes_alive(timeout_s=2 * _POLL_S) and time.monotonic() < end_s:
+        while names & self.wire.processes_alive(timeout_s=_ASK_S) and time.monotonic() < end_s:
             time.sleep(_POLL_S)
 
     def close(self) -> None:
