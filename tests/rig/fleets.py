@@ -106,7 +106,9 @@ class Fleet:
         with words.open("w") as output:
             command = [*CLI, "router", str(self.bench), "--with", "softloop"]
             self.routers.append(subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=self.environment))
-        self.wait_for(lambda: "meeting point of bench" in words.read_text(), "the router")
+        while "meeting point of bench" not in words.read_text():
+            assert self.routers[-1].poll() is None, words.read_text()
+            time.sleep(0.002)
         return self.routers[-1]
 
     def family(self):
