@@ -21,13 +21,14 @@ BENCH_FILE = "bench.toml"
 CERTIFICATE_FILE = "certificate.json"  # one of wire.mcap_layout.RUN_FILES, so that the recorder takes it into the log
 
 
-def make_run_dir(bench: Bench, asked: Path | None) -> Path:
-    """The directory of a new run, made now: `asked`, or `<folder>/<bench>-<UTC time>`.
+def make_run_dir(bench: Bench, asked: Path | None, host: str = "") -> Path:
+    """The directory of a new run, made now: `asked`, or `<folder>/<bench>[-<host>]-<UTC time>`.
 
     Raises:
         Unavailable: it cannot be made, or it holds a run already.
     """
-    path = asked or Path(bench.run.folder) / f"{bench.name}-{strftime('%Y%m%dT%H%M%SZ', gmtime())}"
+    name = f"{bench.name}-{host}" if host else bench.name
+    path = asked or Path(bench.run.folder) / f"{name}-{strftime('%Y%m%dT%H%M%SZ', gmtime())}"
     if (path / BENCH_FILE).exists():
         raise Unavailable(f"{path}: holds a run already; name another with --run-dir")
     try:

@@ -8,10 +8,10 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from softloop.wire.benchfile import Table
+from softloop.wire.benchfile import ProcessTable, Table
 
 
-class RecorderConfig(Table):
+class RecorderConfig(ProcessTable):
     """`[recorder]`: what the log keeps, and how much the recorder may hold back before it has to drop."""
 
     file: str = Field("run.mcap", pattern=r"^[A-Za-z0-9_.-]+\.mcap$", description="name of the log in the run's directory")
@@ -27,7 +27,7 @@ class RecorderConfig(Table):
     )
 
 
-class MonitorConfig(Table):
+class MonitorConfig(ProcessTable):
     """`[monitor]`: the invariants that a process watches at wall pace, and whether it faults the gate when one does not hold."""
 
     faults_gate: bool = Field(False, description="an invariant that does not hold leads the gate to FAULT, reason `invariant`")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Literal
 
@@ -29,11 +30,27 @@ def default_endpoint(bench: str) -> str:
     return f"unixsock-stream/{runtime_dir()}/softloop-{bench}.sock"
 
 
+def loopback(address: str) -> str:
+    """The address, which is empty or an IP address of this machine alone. Raises ValueError on any other."""
+    if address and not is_loopback(address):
+        raise ValueError("must be a loopback address, such as 127.0.0.2")
+    return address
+
+
+def is_loopback(address: str) -> bool:
+    """An IP address of this machine alone."""
+    try:
+        return ip_address(address.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
 class ZenohConfig(Table):
     """`[zenoh]`: how the processes of a bench find each other."""
 
     mode: Literal["peer", "client"] = Field("peer", description="peer: direct links; client: all by way of the meeting point")
     endpoint: str = Field("", description="meeting point; empty: a Unix socket named after the bench")
+    listen: str = Field("", description="peer: address of this host for direct links; empty: that of the meeting point")
     lease_ms: int = Field(5000, ge=50, le=60_000, description="a silent link is given up after this")
 
     @field_validator("endpoint")
@@ -42,6 +59,11 @@ class ZenohConfig(Table):
         if value and not value.startswith(_LOCAL):
             raise ValueError(f"must begin with one of {', '.join(_LOCAL)}")
         return value
+
+    @field_validator("listen")
+    @classmethod
+    def _listens_on_this_machine(cls, value: str) -> str:
+        return loopback(value)
 
     def meeting_point(self, bench: str) -> str:
         return self.endpoint or default_endpoint(bench)

@@ -36,7 +36,13 @@ RUN_FILES = ("bench.toml", "rig.dbc", "parameters.toml", "certificate.json")
 MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}
 LIBRARIES = ("softloop", "numpy", "numba", "eclipse-zenoh")
 # Channels on which several senders count for themselves, and the field that tells them apart.
-SENDER_FIELDS = {"Event": "source", "ProcessStatus": "process", "GateRequest": "origin", "CanFrame": "node"}
+SENDER_FIELDS = {
+    "Event": "source",
+    "ProcessStatus": "process",
+    "GateRequest": "origin",
+    "CanFrame": "node",
+    "ClockOffset": "host",
+}
 
 _HEAD = struct.Struct("<Qq")  # every message begins with seq and stamp_ns
 _U64_END = 1 << 64

@@ -32,7 +32,16 @@ def make_config(
 ) -> zenoh.Config:
     """The one way to a Zenoh configuration: nothing is left to Zenoh's defaults that reaches beyond this machine."""
     config = zenoh.Config()
-    settings: dict[str, Any] = {
+    for name, value in settings_of(mode, listen, connect, lease_ms, listen_must_work=listen_must_work).items():
+        config.insert_json5(name, json.dumps(value))
+    return config
+
+
+def settings_of(
+    mode: str, listen: list[str], connect: list[str], lease_ms: int, *, listen_must_work: bool = True
+) -> dict[str, Any]:
+    """The settings in `make_config`, by the path of each."""
+    return {
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
@@ -54,9 +63,6 @@ def make_config(
         "transport/shared_memory/enabled": False,
         "timestamping/enabled": False,
     }
-    for name, value in settings.items():
-        config.insert_json5(name, json.dumps(value))
-    return config
 
 
 def _patience_ms(mode: str, *, listen_must_work: bool) -> int:
@@ -70,18 +76,21 @@ def _patience_ms(mode: str, *, listen_must_work: bool) -> int:
     return -1 if listen_must_work else 0
 
 
-def own_endpoint(meeting_point: str, process: str) -> str:
-    """Where a peer listens for direct links: beside the meeting point, on a socket or port of its own."""
+def own_endpoint(meeting_point: str, process: str, address: str = "") -> str:
+    """Where a peer listens for direct links: beside the meeting point, or at `address`, on a socket or port of its own."""
     if meeting_point.startswith(UNIX):
         folder = Path(meeting_point[len(UNIX) :]).parent
         return f"{UNIX}{folder}/{Path(meeting_point).stem}.{process}.{os.getpid()}.sock"
+    if address:
+        shown = f"[{address}]" if ":" in address and not address.startswith("[") else address
+        return f"{meeting_point.split('/', 1)[0]}/{shown}:0"
     return meeting_point.rsplit(":", 1)[0] + ":0"
 
 
 def open_session(config: ZenohConfig, bench: str, process: str) -> zenoh.Session:
     """A session of one process on a bench. Raises Unavailable when it cannot listen."""
     meet = config.meeting_point(bench)
-    listen = [own_endpoint(meet, process)] if config.mode == "peer" else []
+    listen = [own_endpoint(meet, process, config.listen)] if config.mode == "peer" else []
     return _open(make_config(config.mode, listen, [meet], config.lease_ms), meet)
 
 
