@@ -37,8 +37,8 @@ ROUTER = "router"  # whoever is the meeting point
 ALL = "**"
 BUSES = "buses/*/*"  # who is on a CAN bus
 FRAMES = f"{CAN.name}/*/*"
-# Arbitration ids of the valve frame and of the driver's answer; a test compares them with the DBC file.
-VALVE_FRAME, DRIVER_FRAME = (f"{CAN.name}/*/{arbitration_id:x}" for arbitration_id in (0x80, 0x90))
+# By arbitration id, the driver's answer and the analogue module; a test compares them with the DBC file.
+DRIVER_FRAME, ANALOG_FRAME = (f"{CAN.name}/*/{arbitration_id:x}" for arbitration_id in (0x90, 0x100))
 
 
 @dataclass(frozen=True)
@@ -47,21 +47,19 @@ class Rights:
 
     Attributes:
         puts: what it may publish on.
-        never: what of that it may not.
         hears: what it may subscribe to.
         asks: what it may put questions on.
         answers: on what it may answer them.
     """
 
     puts: tuple[str, ...] = ()
-    never: tuple[str, ...] = ()
     hears: tuple[str, ...] = ()
     asks: tuple[str, ...] = ()
     answers: tuple[str, ...] = ()
 
     def may_put(self, part: str) -> bool:
         """Whether a channel may be published on. `part`: its key below the bench's, without wildcards."""
-        return any(_matches(one, part) for one in self.puts) and not any(_matches(one, part) for one in self.never)
+        return any(_matches(one, part) for one in self.puts)
 
     def may_hear(self, part: str) -> bool:
         """Whether a channel may be subscribed to."""
@@ -77,16 +75,15 @@ _ON_BUS = {"asks": (BUSES,), "answers": (BUSES,)}
 
 RIGHTS = {
     CONTROLLER: Rights(puts=(COMMAND.name, CYCLE.name, *_TELL), hears=(PRESSURE.name, INCLINATION.name, VALVES.name)),
+    # All frames: it sends the valve frame, and copies the driver's and the bus's errors for the log.
     GATE: Rights(
         puts=(VALVES.name, FRAMES, *_TELL), hears=(COMMAND.name, REQUEST.name, ARM.name, VALVES.name, FRAMES), **_ON_BUS
     ),
-    PRESSURES: Rights(
-        puts=(PRESSURE.name, FRAMES, *_TELL), never=(VALVE_FRAME, DRIVER_FRAME), hears=(VALVES.name, FRAMES), **_ON_BUS
-    ),
+    # The analogue frame: the copy for the log, where the bus is none on Zenoh.
+    PRESSURES: Rights(puts=(PRESSURE.name, ANALOG_FRAME, *_TELL), hears=(VALVES.name, FRAMES), **_ON_BUS),
     INCLINOMETER: Rights(puts=(INCLINATION.name, *_TELL), hears=(VALVES.name,)),
     PLANT: Rights(
-        puts=(TRUTH.name, FRAMES, *_TELL),
-        never=(VALVE_FRAME,),
+        puts=(TRUTH.name, DRIVER_FRAME, ANALOG_FRAME, *_TELL),
         hears=(VALVES.name, FRAMES),
         asks=(BUSES,),
         answers=(BUSES, FAULT.name),
@@ -139,17 +136,16 @@ def _rules(bench: str, identity: str, rights: Rights) -> list[dict[str, Any]]:
     everything = [f"{head}/{ALL}", f"{pace}/{ALL}"]
     rules: list[dict[str, Any]] = []
 
-    def rule(flow: str, messages: list[str], keys: Sequence[str], permission: str = "allow") -> None:
+    def rule(flow: str, messages: list[str], keys: Sequence[str]) -> None:
         if keys:
             name = f"{identity} {len(rules)}"
-            rules.append({"id": name, "permission": permission, "flows": [flow], "messages": messages, "key_exprs": list(keys)})
+            rules.append({"id": name, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": list(keys)})
 
     def below(parts: Sequence[str]) -> list[str]:
         return [f"{head}/{part}" for part in parts]
 
     hears, answers, asks = below(rights.hears), below(rights.answers), below(rights.asks)
     rule("ingress", ["put"], [*below(rights.puts), f"{pace}/*/{own}"])
-    rule("ingress", ["put"], below(rights.never), "deny")
     rule("ingress", ["declare_subscriber"], [*hears, f"{pace}/*/*"])
     rule("ingress", ["query"], asks)
     rule("ingress", ["declare_queryable", "reply"], answers)
