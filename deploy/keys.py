@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
+from typing import Any
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -20,10 +21,10 @@ from softloop.deploy.bench import Bench, find_bench, load_bench
 from softloop.deploy.node import processes_of
 from softloop.wire.config import TLS, TlsConfig
 from softloop.wire.errors import EXIT_OK, BadConfig, Unavailable
-from softloop.wire.identity import AUTHORITY, certificate_file, issued_by, key_file, load_certificate, wall_now
-from softloop.wire.rights import LAUNCHER, RIGHTS, ROUTER, access_control, common_name
+from softloop.wire.identity import AUTHORITY, certificate_file, issued_by, key_file, load_certificate, settings, wall_now
+from softloop.wire.rights import LAUNCHER, RIGHTS, ROUTER, common_name
 
-RULES = "access.json5"
+ZENOHD = "zenohd.json5"
 AUTHORITY_DAYS = 3650
 # The clocks of a bench's computers may differ before they are set: what is made now was good yesterday.
 EARLIER = timedelta(days=1)
@@ -57,7 +58,7 @@ def make_keys(bench_file: Path, *, renew: bool, only: Collection[str], authority
             raise Unavailable(f"{maker.folder}: all {len(wanted)} identities are there; --renew makes them anew")
         for name in made:
             maker.make(name)
-        maker.write_rules()
+        maker.write_router()
     print(f"{maker.folder}: {', '.join(made)}; good until {maker.until:%Y-%m-%d}", flush=True)
     return EXIT_OK
 
@@ -145,10 +146,28 @@ class _Maker:
         _put(key_file(self.folder, name), secret, 0o600)
         _put(certificate_file(self.folder, name), certificate.public_bytes(Encoding.PEM), 0o644)
 
-    def write_rules(self) -> None:
-        """The access rules, for a `zenohd` at the meeting point; softloop's own processes have them from the table itself."""
-        rules = access_control(self.bench.name, self.tls.operators, self.tls.guests)
-        _put(self.folder / RULES, json.dumps({"access_control": rules}, indent=1).encode(), 0o644)
+    def write_router(self) -> None:
+        """The configuration of a `zenohd` at the meeting point; softloop's own processes have the rules from the table itself."""
+        told = {
+            "mode": "router",
+            "listen/endpoints": [self.bench.zenoh.endpoint],
+            "scouting/multicast/enabled": False,
+            "adminspace/enabled": False,
+            **settings(self.tls, self.bench.name, ROUTER),
+        }
+        _put(self.folder / ZENOHD, json.dumps(_nested(told), indent=1).encode(), 0o644)
+
+
+def _nested(told: Mapping[str, Any]) -> dict[str, Any]:
+    """`{"a/b": 1}` as `{"a": {"b": 1}}`."""
+    content: dict[str, Any] = {}
+    for path, value in told.items():
+        *outer, last = path.split("/")
+        at = content
+        for part in outer:
+            at = at.setdefault(part, {})
+        at[last] = value
+    return content
 
 
 def _name(text: str) -> x509.Name:

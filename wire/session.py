@@ -91,7 +91,15 @@ def own_endpoint(meeting_point: str, process: str) -> str:
 
 def open_session(config: ZenohConfig, bench: str, process: str) -> zenoh.Session:
     """A session of one process on a bench. Raises Unavailable when it cannot listen, or has no good identity."""
-    return _open_as(identity_of(config, bench, process), config, bench, process)
+    return _open_as(_known(config, bench, process), config, bench, process)
+
+
+def _known(config: ZenohConfig, bench: str, process: str) -> Identity | None:
+    """Who this is; what is soon to be wrong with that is said."""
+    identity = identity_of(config, bench, process)
+    if identity is not None and identity.warning:
+        sys.stderr.write(f"[{process}] {identity.warning}\n")
+    return identity
 
 
 def _open_as(identity: Identity | None, config: ZenohConfig, bench: str, process: str) -> zenoh.Session:
@@ -105,7 +113,7 @@ def _open_as(identity: Identity | None, config: ZenohConfig, bench: str, process
 def open_router(config: ZenohConfig, bench: str) -> zenoh.Session:
     """The meeting point itself. Raises Unavailable when its address is taken, or it has no good identity."""
     meet = config.meeting_point(bench)
-    identity = identity_of(config, bench, ROUTER)
+    identity = _known(config, bench, ROUTER)
     return _open(make_config("router", [meet], [], config.lease_ms, identity=identity), meet)
 
 
@@ -309,8 +317,6 @@ class Wire:
 @contextmanager
 def open_wire(config: ZenohConfig, bench: str, process: str) -> Iterator[Wire]:
     """A `Wire` whose session is closed at the end, whatever happened."""
-    identity = identity_of(config, bench, process)
-    if identity is not None and identity.warning:
-        sys.stderr.write(f"[{process}] {identity.warning}\n")
+    identity = _known(config, bench, process)
     with _open_as(identity, config, bench, process) as session:
         yield Wire(session, bench, process, identity)

@@ -3,16 +3,20 @@
 import stat
 import subprocess
 import sys
+import time
 from datetime import timedelta
 
 import pytest
+import zenoh
 from cryptography import x509
 
 from softloop.deploy import keys
 from softloop.deploy.bench import load_bench
 from softloop.wire import identity as i
+from softloop.wire.channels import COMMAND
 from softloop.wire.errors import BadConfig, Unavailable
 from softloop.wire.identity import certificate_file, check_identity, issued_by, key_file, load_certificate, wall_now
+from softloop.wire.session import open_wire
 from tests.security.secured import NAME, make, write_secured
 
 
@@ -91,7 +95,7 @@ def test_renewed_identities_are_of_the_same_authority(file, tmp_path):
     make(file, renew=True)
     again = content(tmp_path / "keys")
     assert again["ca.pem"] == before["ca.pem"]
-    assert all(again[name] != before[name] for name in before if name not in ("ca.pem", "ca.key", "access.json5"))
+    assert all(again[name] != before[name] for name in before if name not in ("ca.pem", "ca.key", "zenohd.json5"))
 
 
 def test_a_new_authority_makes_all_older_keys_void(file, tmp_path):
@@ -183,3 +187,18 @@ def test_the_command_line(file):
         done = softloop(*words)
         assert (done.returncode, done.stderr.count("\n")) == (code, 1), done.stderr
     assert softloop("--renew", "--only", "guest", "--days", "30").returncode == 0
+
+
+def test_the_file_for_zenohd_is_a_whole_configuration(file, tmp_path):
+    make(file)
+    bench = load_bench(file)
+    with (
+        zenoh.open(zenoh.Config.from_file(str(tmp_path / "keys" / keys.ZENOHD))),
+        open_wire(bench.zenoh, NAME, "controller") as controller,
+        open_wire(bench.zenoh, NAME, "valves") as gate,
+    ):
+        commands, put = gate.inbox(COMMAND), controller.publisher(COMMAND)
+        end = time.monotonic() + 20.0
+        while commands.take(0.05) is None:
+            put(b"x")
+            assert time.monotonic() < end, "nothing passes"
