@@ -8,13 +8,13 @@ import pytest
 import zenoh
 
 from softloop.devices.protocols import can_frames
-from softloop.wire.can_frame import make_frame, pack_frame
 from softloop.wire.can_zenoh import ZenohBus
-from softloop.wire.channels import ARM, COMMAND, CYCLE, FAULT, PRESSURE, REQUEST, VALVES, can_key, key
+from softloop.wire.channels import ARM, COMMAND, CYCLE, FAULT, PRESSURE, REQUEST, VALVES, key
 from softloop.wire.errors import BadConfig, Unavailable
-from softloop.wire.messages import constant, message
+from softloop.wire.messages import message
 from softloop.wire.questions import Questions, ask
 from softloop.wire.session import open_router, open_wire
+from tests.security.attackers import ORIGIN, attackers_config, command, deeds, request
 from tests.security.secured import NAME, secured
 
 WAIT_S = 20.0
@@ -36,22 +36,6 @@ def until(condition, what):
     while not condition():
         assert time.monotonic() < end, what
         time.sleep(0.01)
-
-
-def command(seq, charge_ma=200.0):
-    kind = message("ValveCommand")
-    return kind.pack(kind.make(seq=seq, stamp_ns=time.monotonic_ns(), charge_current_ma=charge_ma, ready=1))
-
-
-def request(action, seq=1):
-    kind = message("GateRequest")
-    code = constant("GateRequest", f"ACTION_{action.upper()}")
-    return kind.pack(kind.make(seq=seq, stamp_ns=time.monotonic_ns(), origin=666, action=code))
-
-
-def valve_frame():
-    data = can_frames.encode_valve_command(can_frames.ValveCommandFrame(1, 1, 4000, 0, 1))
-    return pack_frame(make_frame(1, time.monotonic_ns(), 666, can_frames.VALVE_COMMAND_ID, data, 0))
 
 
 class Rig:
@@ -99,7 +83,7 @@ class Rig:
         frames = []
         while (frame := self.driver.recv_frame(0.0)) is not None:
             frames.append(frame)
-        assert [f for f in frames if f.node == 666] == []
+        assert [f for f in frames if f.node == ORIGIN] == []
         foreign = [k for k, payload in self.log.take_all()[0]]
         assert foreign == []
 
@@ -124,24 +108,11 @@ def one_rig(request):
 
 def attack(session):
     """All that a session can do to a bench by its keys."""
-    for full_key, payload in deeds():
+    for full_key, payload in deeds(NAME):
         session.put(full_key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
     for full_key in (key(NAME, COMMAND), f"softloop/{NAME}/**", "softloop/**"):
         session.delete(full_key)
         session.get(full_key, timeout=0.2)
-
-
-def deeds():
-    frame_key = can_key(NAME, "can0", can_frames.VALVE_COMMAND_ID)
-    yield key(NAME, COMMAND), command(1)
-    yield frame_key, valve_frame()
-    for wide in (f"softloop/{NAME}/*", f"softloop/{NAME}/**", "softloop/**", "**", f"softloop/{NAME}/com$*"):
-        yield wide, command(2)
-    for wide in (f"softloop/{NAME}/can/can0/*", f"softloop/{NAME}/can/**", f"softloop/*/can/can0/{0x80:x}"):
-        yield wide, valve_frame()
-    for wide in (key(NAME, ARM), key(NAME, REQUEST), f"softloop/{NAME}/*", "**"):
-        yield wide, request("arm")
-    yield key(NAME, VALVES), b"x" * 40
 
 
 def listen(session):
@@ -200,7 +171,7 @@ def test_a_good_certificate_without_the_right_moves_reads_and_arms_nothing(one_r
 def test_a_guest_reads_and_stops_and_does_nothing_else(mode):
     with rig(mode) as made, made.at.attacker(made.at.keys, "guest") as session:
         until(lambda: session.info.routers_zid(), "no link")
-        for full_key, payload in deeds():
+        for full_key, payload in deeds(NAME):
             session.put(full_key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
         session.put(key(NAME, REQUEST), request("stop"))
         taken = []
@@ -263,14 +234,14 @@ def test_nobody_says_that_another_is_alive():
 def test_a_client_of_a_false_meeting_point_believes_nothing():
     """Somebody with a good certificate of a process stands at the router's address: it is no router to those who join."""
     with secured() as at:
-        config = at.config(at.keys, "pressures", "router")
+        config = attackers_config(at.bench, at.keys, "pressures", "router")
         config.insert_json5("listen/endpoints", f'["{at.bench.zenoh.endpoint}"]')
         config.insert_json5("connect/endpoints", "[]")
         with zenoh.open(config) as false_router, open_wire(at.bench.zenoh, NAME, "valves") as gate:
             commands, requests = gate.inbox(COMMAND), gate.inbox(REQUEST, ARM)
             until(lambda: gate.session.info.routers_zid(), "no link")
             time.sleep(0.3)
-            for full_key, payload in deeds():
+            for full_key, payload in deeds(NAME):
                 false_router.put(full_key, payload)
             time.sleep(0.5)
             assert commands.take_all() == []
