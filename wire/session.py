@@ -19,7 +19,7 @@ import zenoh
 
 from softloop.wire.backlog import Backlog
 from softloop.wire.channels import ROOT, Channel, alive_key, key
-from softloop.wire.config import ZenohConfig
+from softloop.wire.config import TLS, ZenohConfig
 from softloop.wire.errors import Unavailable
 from softloop.wire.identity import Identity, identity_of
 from softloop.wire.rights import ROUTER
@@ -130,7 +130,14 @@ def _open(config: zenoh.Config, where: str) -> zenoh.Session:
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise Unavailable(f"Zenoh endpoint {where}: {_short(error)}") from None
+        raise Unavailable(f"Zenoh endpoint {where}: {_short(error)}{_hint(where, str(error))}") from None
+
+
+def _hint(where: str, text: str) -> str:
+    """Zenoh does not say why a link over TLS does not come about."""
+    if not where.startswith(TLS) or "connect" not in text:
+        return ""
+    return "; nobody is there, or its certificate is of another authority, expired, or not of this address"
 
 
 def _check_socket_path(path: str) -> None:

@@ -3,9 +3,9 @@
     python -m tests.campaigns.flood [--seconds 20] [--rounds 3] [--mode client] [--json FILE]
 
 Rigs run armed for so long, one after the other in turn: alone, and beside four attackers at once (no certificate, one of another
-authority, one that expired, and a sensor's, which is good and has no right). Each tries without pause to move a valve, to read, to
-arm and to flood. A failure is a rig that does not stay armed, a message in its log that it did not send, or one that an attacker
-heard. Ticks that the controller left out are counted for both, and not judged: on a busy machine there are some in either.
+authority, one that expired, and a sensor's, which is good and has no right). Each tries to move a valve, to read, to arm and to
+flood, without pause. A failure is a rig that does not stay armed, a message in its log that is not its own, or one that an
+attacker heard. Ticks that the controller left out are counted for both, and not judged: on a busy machine there are some in either.
 """
 
 import json

@@ -7,7 +7,9 @@ from contextlib import ExitStack, contextmanager
 import pytest
 import zenoh
 
+from softloop.deploy.bench import load_bench
 from softloop.devices.protocols import can_frames
+from softloop.wire import session as session_module
 from softloop.wire.can_zenoh import ZenohBus
 from softloop.wire.channels import ARM, COMMAND, CYCLE, FAULT, PRESSURE, REQUEST, VALVES, key
 from softloop.wire.errors import BadConfig, Unavailable
@@ -246,3 +248,15 @@ def test_a_client_of_a_false_meeting_point_believes_nothing():
             time.sleep(0.5)
             assert commands.take_all() == []
             assert requests.take_all() == []
+
+
+def test_a_meeting_point_of_another_authority_is_none(monkeypatch):
+    monkeypatch.setattr(session_module, "CLIENT_PATIENCE_MS", 1500)
+    with secured() as at:
+        stranger = load_bench(at.folder / "wrong.toml")
+        with (
+            open_router(stranger.zenoh, NAME),
+            pytest.raises(Unavailable, match="its certificate is of another authority"),
+            open_wire(at.bench.zenoh, NAME, "controller"),
+        ):
+            pass
