@@ -5,7 +5,7 @@
 Rigs run armed for so long, one after the other in turn: alone, and beside four attackers at once (no certificate, one of another
 authority, one that expired, and a sensor's, which is good and has no right). Each tries to move a valve, to read, to arm and to
 flood, without pause. A failure is a rig that does not stay armed, a message in its log that is not its own, or one that an
-attacker heard. Ticks that the controller left out are counted for both, and not judged: on a busy machine there are some in either.
+attacker heard. Ticks that the controller left out are counted for both and not judged: on a busy machine some are in either.
 """
 
 import json
