@@ -17,8 +17,7 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from softloop.deploy.bench import Bench, find_bench, load_bench
-from softloop.deploy.node import processes_of
+from softloop.deploy.bench import PROCESS_NAMES, Bench, find_bench, load_bench
 from softloop.wire.config import TLS, TlsConfig
 from softloop.wire.errors import EXIT_OK, BadConfig, Unavailable
 from softloop.wire.identity import AUTHORITY, certificate_file, issued_by, key_file, load_certificate, settings, wall_now
@@ -34,7 +33,8 @@ HERE = ("localhost", "127.0.0.1", "::1")
 def identities_of(bench: Bench) -> list[str]:
     """Everybody who is somebody on a bench: the meeting point, its processes, its people. Raises BadConfig without TLS."""
     tls = _tls(bench)
-    return [ROUTER, LAUNCHER, *(process.name for process in processes_of(bench)), *tls.operators, *tls.guests]
+    processes = (name for name in PROCESS_NAMES if getattr(bench, name) is not None)
+    return [ROUTER, LAUNCHER, *processes, *tls.operators, *tls.guests]
 
 
 def make_keys(bench_file: Path, *, renew: bool, only: Collection[str], authority: bool, days: int | None) -> int:

@@ -239,9 +239,7 @@ def _address_of(url: str | None) -> tuple[str, int]:
             f"{url}: expected listen://HOST:PORT with a port from 0 to 65535, as listen://127.0.0.1:7000"
         )
     if not _is_loopback(parts.hostname):
-        raise serial.SerialException(
-            f"{url}: would listen off this machine, where nothing secures it; only 127.0.0.1 or localhost"
-        )
+        raise serial.SerialException(f"{url}: would listen off this machine, where nothing secures it; use 127.0.0.1")
     return parts.hostname, number
 
 
