@@ -14,7 +14,6 @@ from tests.rig import rigs
 pytestmark = pytest.mark.rig
 TRACE = "zenoh::net::routing::interceptor=trace"
 LINE = re.compile(r"(ThreadId\(\d+\)) zenoh::net::routing::interceptor\S*: (.*)")
-MONITOR = "[monitor]\n"
 
 
 def refused(text):
@@ -43,8 +42,7 @@ def test_nothing_that_a_rig_does_is_refused(site, pace, monkeypatch):
     monkeypatch.setenv("RUST_LOG", TRACE)
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[2]))
     monkeypatch.setattr(rigs, "PROGRAM", (sys.executable, "-m", "tests.security.traced_cli"))
-    text = site.text + (MONITOR if pace == "wall" else "")
-    with rigs.running(text, name=NAME, arguments=("--duration", "3", "--pace", pace)) as rig:
+    with rigs.running(site.text, name=NAME, arguments=("--duration", "3", "--pace", pace)) as rig:
         assert rig.finish() == 0, rig.output[-2000:] + rig.logs()
         said = {"launcher": rig.output} | {file.name: file.read_text() for file in rig.run_dir.glob("*.log")}
         assert "interceptor" in said["launcher"], "Zenoh's trace is not there"
