@@ -8,11 +8,11 @@ flood, without pause. A failure is a rig that does not stay armed, a message in 
 attacker heard. Ticks that the controller left out are counted for both and not judged: on a busy machine some are in either.
 """
 
-import json
 import shutil
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -23,14 +23,13 @@ from softloop.wire.messages import constant
 from tests.campaigns.outcome import Outcome, options, steps
 from tests.rig.rigs import running
 from tests.rig.test_whole_rig import WIDE
-from tests.security.attackers import ORIGIN, start
+from tests.security.attackers import ORIGIN, Attacker
 from tests.security.secured import Secured, zenoh_table
 
 NAME = "sec"
 ARMED, FAULT = constant("ValveStatus", "GATE_ARMED"), constant("ValveStatus", "GATE_FAULT")
 WHO = (("no certificate", "keys", ""), ("a wrong one", "wrong", "controller"), ("an expired one", "expired", "controller"))
 WHO += (("one without the right", "keys", "pressures"),)
-ENDS_WITHIN_S = 60.0
 
 
 def bench_text(folder, mode):
@@ -61,24 +60,29 @@ class Site:
 def one_run(site, seconds, outcome, *, attacked):
     """One rig, armed for `seconds`; counts what it did into `outcome`."""
     under = "under attack" if attacked else "alone"
-    with running(site.text, name=NAME, arguments=("--duration", str(seconds))) as rig:
+    who = WHO if attacked else ()
+    with ExitStack() as stack:
+        attackers = [Attacker(site.at.file, site.folder / folder, name, "client", seconds) for _, folder, name in who]
+        for attacker in attackers:
+            stack.callback(attacker.close)
+        rig = stack.enter_context(running(site.text, name=NAME, arguments=("--duration", str(seconds))))
         rig.wait_for_word("gate armed")
-        attackers = [start(site.at.file, site.folder / f, name, "client", seconds) for _, f, name in WHO if attacked]
+        for attacker in attackers:
+            attacker.begin()
         code = rig.finish()
-        for (who, _, _), process in zip(WHO, attackers, strict=False):
-            count_attacker(outcome, who, process)
+        for (name, _, _), attacker in zip(who, attackers, strict=True):
+            count_attacker(outcome, name, attacker.done())
         if code != 0:
-            outcome.fail(f"{under}: the rig ended with {code}: {rig.output.strip().splitlines()[-1]}")
+            outcome.fail(f"{under}: the rig ended with {code}: {rig.output.strip().splitlines()[-2:]}")
         if rig.left_over():
             outcome.fail(f"{under}: left over: {rig.left_over()}")
         count_rig(outcome, under, open_run(rig.run_dir))
 
 
-def count_attacker(outcome, who, process):
-    said, _ = process.communicate(timeout=ENDS_WITHIN_S)
-    done = json.loads(said)
+def count_attacker(outcome, who, done):
     outcome.count(f"messages put by {who}", done["puts"])
-    outcome.count(f"sessions tried by {who}", done["sessions"] + done["refused"])
+    outcome.count(f"links tried by {who}", done["sessions"] + done["refused"])
+    outcome.count(f"links had by {who}", done["sessions"])
     if done["heard"]:
         outcome.fail(f"{who}: heard {done['heard']} messages of the rig")
 

@@ -1,8 +1,8 @@
 """Those who should not be there, as processes: python -m tests.security.attackers BENCH KEYS NAME MODE SECONDS
 
 Each tries without pause to move a valve, to read, to re-arm and to flood, and prints a JSON line of what it did and heard. NAME -
-is one without a certificate. They ask for the idle scheduling class: on a machine of two processors they stand for somebody on
-another computer, who takes no processor time from the rig.
+is one without a certificate. They are nice and of the batch class: on a machine of two processors they stand for somebody on
+another computer, who takes no processor time from the rig, but are not to be kept from it altogether.
 """
 
 import json
@@ -24,6 +24,7 @@ from softloop.wire.session import make_config
 
 ORIGIN = 666
 FLOOD_BYTES = 1000
+ENDS_WITHIN_S = 60.0
 
 
 def attackers_config(bench, keys, name, mode):
@@ -77,10 +78,13 @@ def deeds(bench, seq=1):
 
 
 def main():
-    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    os.nice(10)
     bench, keys, name, mode, seconds = load_bench(Path(sys.argv[1])), *sys.argv[2:]
     done = {"sessions": 0, "refused": 0, "puts": 0, "heard": 0}
     config = attackers_config(bench, keys, name.strip("-"), mode)
+    print("ready", flush=True)
+    sys.stdin.readline()
     end = time.monotonic() + float(seconds)
     while time.monotonic() < end:
         with suppress(zenoh.ZError):
@@ -93,14 +97,14 @@ def main():
 
 
 def flood(session, bench, done, end):
-    """Until the end; a session that has no link after a second makes way for another."""
+    """Until the end; a session that has no link after 3 s makes way for another."""
     own = set()
 
     def note(sample):
         done["heard"] += bytes(sample.payload)[:8] not in own
 
     listener = session.declare_subscriber(f"softloop/{bench}/**", zenoh.handlers.Callback(note, indirect=False))
-    give_up = time.monotonic() + 1.0
+    give_up = time.monotonic() + 3.0
     padding = os.urandom(FLOOD_BYTES)
     while time.monotonic() < end and (session.info.routers_zid() or time.monotonic() < give_up):
         for full_key, payload in deeds(bench, done["puts"] + 1):
@@ -112,10 +116,27 @@ def flood(session, bench, done, end):
     listener.undeclare()
 
 
-def start(bench_file, keys, name, mode, seconds):
-    """Such a process; its standard output is its JSON line."""
-    words = [sys.executable, "-m", "tests.security.attackers", str(bench_file), str(keys), name or "-", mode, str(seconds)]
-    return subprocess.Popen(words, stdout=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL)
+class Attacker:
+    """Such a process, started and ready; it waits for `begin`."""
+
+    def __init__(self, bench_file, keys, name, mode, seconds):
+        words = [sys.executable, "-m", "tests.security.attackers", str(bench_file), str(keys), name or "-", mode, str(seconds)]
+        self.process = subprocess.Popen(words, stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True)
+        assert self.process.stdout.readline() == "ready\n"
+
+    def begin(self):
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+
+    def done(self):
+        """Wait for its end; what it did and heard."""
+        said, _ = self.process.communicate(timeout=ENDS_WITHIN_S)
+        return json.loads(said)
+
+    def close(self):
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
 
 
 if __name__ == "__main__":
