@@ -44,6 +44,7 @@ class Site:
     """A bench with its keys, and the keys of its attackers, in a folder that goes with it."""
 
     def __init__(self, mode):
+        self.mode = mode  # of the rig, and of the attackers: in mode peer they reach every process
         from softloop.deploy.bench import shipped_benches  # noqa: PLC0415
 
         self.folder = Path(tempfile.mkdtemp(prefix="sl-flood-"))
@@ -62,7 +63,7 @@ def one_run(site, seconds, outcome, *, attacked):
     under = "under attack" if attacked else "alone"
     who = WHO if attacked else ()
     with ExitStack() as stack:
-        attackers = [Attacker(site.at.file, site.folder / folder, name, "client", seconds) for _, folder, name in who]
+        attackers = [Attacker(site.at.file, site.folder / folder, name, site.mode, seconds) for _, folder, name in who]
         for attacker in attackers:
             stack.callback(attacker.close)
         rig = stack.enter_context(running(site.text, name=NAME, arguments=("--duration", str(seconds))))
@@ -84,7 +85,7 @@ def count_attacker(outcome, who, done):
     outcome.count(f"links tried by {who}", done["sessions"] + done["refused"])
     outcome.count(f"links had by {who}", done["sessions"])
     if done["heard"]:
-        outcome.fail(f"{who}: heard {done['heard']} messages of the rig")
+        outcome.fail(f"{who}: heard {done['heard']} messages of the rig: {done['keys']}")
 
 
 def count_rig(outcome, under, log):

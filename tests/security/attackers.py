@@ -19,11 +19,12 @@ from softloop.deploy.bench import load_bench
 from softloop.wire.channels import ARM, COMMAND, REQUEST, can_key, key
 from softloop.wire.identity import Identity, settings
 from softloop.wire.messages import constant, message
-from softloop.wire.rights import Rights
+from softloop.wire.rights import Rights, rights_of
 from softloop.wire.session import make_config
 
 ORIGIN = 666
 FLOOD_BYTES = 1000
+MARK = b"ours"  # what a session puts it also hears itself
 ENDS_WITHIN_S = 60.0
 
 
@@ -81,8 +82,10 @@ def main():
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     os.nice(10)
     bench, keys, name, mode, seconds = load_bench(Path(sys.argv[1])), *sys.argv[2:]
-    done = {"sessions": 0, "refused": 0, "puts": 0, "heard": 0}
+    done = {"sessions": 0, "refused": 0, "puts": 0, "heard": 0, "keys": []}
     config = attackers_config(bench, keys, name.strip("-"), mode)
+    has = Path(keys) == Path(bench.zenoh.tls.folder) and name != "-"  # a certificate that is good for a link
+    rights = rights_of(name, [], []) if has else Rights()
     print("ready", flush=True)
     sys.stdin.readline()
     end = time.monotonic() + float(seconds)
@@ -90,18 +93,20 @@ def main():
         with suppress(zenoh.ZError):
             with zenoh.open(config) as session:
                 done["sessions"] += 1
-                flood(session, bench.name, done, end)
+                flood(session, bench.name, rights, done, end)
             continue
         done["refused"] += 1
     print(json.dumps(done), flush=True)
 
 
-def flood(session, bench, done, end):
-    """Until the end; a session that has no link after 3 s makes way for another."""
-    own = set()
+def flood(session, bench, rights, done, end):
+    """Until the end; a session that has no link after 3 s makes way for another. What `rights` do not let it hear is counted."""
 
     def note(sample):
-        done["heard"] += bytes(sample.payload)[:8] not in own
+        part = str(sample.key_expr).removeprefix(f"softloop/{bench}/")
+        if (sample.attachment is None or bytes(sample.attachment) != MARK) and not rights.may_hear(part):
+            done["heard"] += 1
+            done["keys"] = sorted({*done["keys"], str(sample.key_expr)})[:20]
 
     listener = session.declare_subscriber(f"softloop/{bench}/**", zenoh.handlers.Callback(note, indirect=False))
     give_up = time.monotonic() + 3.0
@@ -109,10 +114,8 @@ def flood(session, bench, done, end):
     while time.monotonic() < end and (session.info.routers_zid() or time.monotonic() < give_up):
         for full_key, payload in deeds(bench, done["puts"] + 1):
             for sent in (payload, payload + padding):
-                own.add(sent[:8])
-                session.put(full_key, sent, priority=zenoh.Priority.REAL_TIME)
+                session.put(full_key, sent, priority=zenoh.Priority.REAL_TIME, attachment=MARK)
                 done["puts"] += 1
-        own = set(list(own)[-1000:])
     listener.undeclare()
 
 
