@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from softloop.wire.benchfile import Table
+from softloop.wire.benchfile import ProcessTable, Table
 
 
 class ActuationConfig(Table):
@@ -101,7 +101,7 @@ class PressureConfig(Table):
     delta2: float = Field(60.0, ge=0, description="bound of Delta_2, kPa/s")
 
 
-class ControllerConfig(Table):
+class ControllerConfig(ProcessTable):
     """`[controller]`: the law, its trajectory, and what it is told of delays and budgets."""
 
     law: Literal["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure"] = Field(

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timedelta
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -18,10 +17,21 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from softloop.deploy.bench import PROCESS_NAMES, Bench, find_bench, load_bench
+from softloop.deploy.zenohd import nested
 from softloop.wire.config import TLS, TlsConfig
 from softloop.wire.errors import EXIT_OK, BadConfig, Unavailable
-from softloop.wire.identity import AUTHORITY, certificate_file, issued_by, key_file, load_certificate, settings, wall_now
-from softloop.wire.rights import LAUNCHER, RIGHTS, ROUTER, common_name
+from softloop.wire.identity import (
+    AUTHORITY,
+    Identity,
+    certificate_file,
+    issued_by,
+    key_file,
+    load_certificate,
+    settings,
+    wall_now,
+)
+from softloop.wire.rights import FOLLOWER, LAUNCHER, RIGHTS, ROUTER, common_name
+from softloop.wire.session import settings_of
 
 ZENOHD = "zenohd.json5"
 AUTHORITY_DAYS = 3650
@@ -34,7 +44,8 @@ def identities_of(bench: Bench) -> list[str]:
     """Everybody who is somebody on a bench: the meeting point, its processes, its people. Raises BadConfig without TLS."""
     tls = _tls(bench)
     processes = (name for name in PROCESS_NAMES if getattr(bench, name) is not None)
-    return [ROUTER, LAUNCHER, *processes, *tls.operators, *tls.guests]
+    launchers = [LAUNCHER, FOLLOWER] if bench.hosts else [LAUNCHER]
+    return [ROUTER, *launchers, *processes, *tls.operators, *tls.guests]
 
 
 def make_keys(bench_file: Path, *, renew: bool, only: Collection[str], authority: bool, days: int | None) -> int:
@@ -135,7 +146,8 @@ class _Maker:
 
     def _hosts(self) -> Iterator[x509.GeneralName]:
         where = self.bench.zenoh.endpoint.removeprefix(TLS).rpartition(":")[0].strip("[]")
-        for host in dict.fromkeys((where, *self.tls.names, *HERE)):
+        machines = [machine.address for machine in self.bench.hosts.values() if machine.address]
+        for host in dict.fromkeys((where, *machines, *self.tls.names, *HERE)):
             try:
                 yield x509.IPAddress(ip_address(host))
             except ValueError:
@@ -148,26 +160,10 @@ class _Maker:
 
     def write_router(self) -> None:
         """The configuration of a `zenohd` at the meeting point; softloop's own processes have the rules from the table itself."""
-        told = {
-            "mode": "router",
-            "listen/endpoints": [self.bench.zenoh.endpoint],
-            "scouting/multicast/enabled": False,
-            "adminspace/enabled": False,
-            **settings(self.tls, self.bench.name, ROUTER),
-        }
-        _put(self.folder / ZENOHD, json.dumps(_nested(told), indent=1).encode(), 0o644)
-
-
-def _nested(told: Mapping[str, Any]) -> dict[str, Any]:
-    """`{"a/b": 1}` as `{"a": {"b": 1}}`."""
-    content: dict[str, Any] = {}
-    for path, value in told.items():
-        *outer, last = path.split("/")
-        at = content
-        for part in outer:
-            at = at.setdefault(part, {})
-        at[last] = value
-    return content
+        zenoh = self.bench.zenoh
+        identity = Identity(ROUTER, RIGHTS[ROUTER], settings(self.tls, self.bench.name, ROUTER))
+        told = settings_of("router", [zenoh.endpoint], [], zenoh.lease_ms, identity=identity)
+        _put(self.folder / ZENOHD, json.dumps(nested(told), indent=1).encode(), 0o644)
 
 
 def _name(text: str) -> x509.Name:

@@ -24,6 +24,7 @@ DRIVERS = names_of("ValveStatus", "DRIVER_")
 PHASES = names_of("CycleRecord", "PHASE_")
 LOADS = {1: "payload", 2: "contact"}
 INVARIANTS = names_of("Event", "INVARIANT_")
+CLOCKS, CLOCK_DRIFT = names_of("Event", "CLOCK_"), constant("Event", "CLOCK_DRIFT")
 FAULTS = names_of("Event", "FAULT_")
 _KINDS = names_of("Event", "KIND_")
 _BACKLOG = 4096
@@ -124,6 +125,11 @@ def _event_text(event: Any) -> str:
     if kind == "process":
         name = _SOURCE_NAMES.get(event.reason, "a viewer")
         return f"{name} is back after {event.value:.1f} s" if event.code else f"{name} was lost"
+    if kind == "clock":
+        unit = "ppm" if event.code == CLOCK_DRIFT else "ms"
+        return f"clock of host {event.reason}: {CLOCKS.get(event.code, event.code)} ({event.value:.4g} {unit})"
+    if kind == "router":
+        return f"the meeting point is back after {event.value:.1f} s" if event.code else "the meeting point was lost"
     if kind == "driver":
         return f"valve driver {DRIVERS.get(event.code, event.code)}"
     if kind == "bus":

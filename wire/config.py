@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import tempfile
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Literal, Self
 
@@ -30,6 +31,23 @@ def runtime_dir() -> Path:
 def default_endpoint(bench: str) -> str:
     """Where a bench meets unless its file says otherwise: a Unix socket named after it."""
     return f"unixsock-stream/{runtime_dir()}/softloop-{bench}.sock"
+
+
+def ip(address: str) -> str:
+    """The address, which is empty or an IP address. Raises ValueError on any other."""
+    try:
+        ip_address(address.strip("[]") or "::1")
+    except ValueError:
+        raise ValueError("must be an IP address, such as 127.0.0.2") from None
+    return address
+
+
+def is_loopback(address: str) -> bool:
+    """An IP address of this machine alone."""
+    try:
+        return ip_address(address.strip("[]")).is_loopback
+    except ValueError:
+        return False
 
 
 class TlsConfig(Table):
@@ -69,6 +87,7 @@ class ZenohConfig(Table):
 
     mode: Literal["peer", "client"] = Field("peer", description="peer: direct links; client: all by way of the meeting point")
     endpoint: str = Field("", description="meeting point; empty: a Unix socket named after the bench")
+    listen: str = Field("", description="peer: address of this host for direct links; empty: that of the meeting point")
     lease_ms: int = Field(5000, ge=50, le=60_000, description="a silent link is given up after this")
 
     tls: TlsConfig | None = None
@@ -80,11 +99,18 @@ class ZenohConfig(Table):
             raise ValueError(f"must begin with one of {', '.join(_LOCAL)}, or, off this machine too, with {TLS}")
         return value
 
+    @field_validator("listen")
+    @classmethod
+    def _listens_on_this_machine(cls, value: str) -> str:
+        return ip(value)
+
     @model_validator(mode="after")
     def _is_secured(self) -> Self:
         """Off this machine only with TLS; and TLS never by half."""
         if self.endpoint.startswith(TLS) and self.tls is None:
             raise ValueError("an endpoint tls/... needs the table [zenoh.tls]; see docs/security.md")
+        if self.listen and self.tls is None and not is_loopback(self.listen):
+            raise ValueError("an address off this machine to listen on needs the table [zenoh.tls]; see docs/security.md")
         if self.tls is not None and not self.endpoint.startswith(TLS):
             raise ValueError("with [zenoh.tls] the endpoint must be tls/HOST:PORT")
         return self

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from softloop.wire.config import TlsConfig, ZenohConfig
 from softloop.wire.errors import Unavailable
-from softloop.wire.rights import RIGHTS, Rights, access_control, common_name, rights_of
+from softloop.wire.rights import FOLLOWER, LAUNCHER, RIGHTS, Rights, access_control, common_name, rights_of
 
 if TYPE_CHECKING:
     from cryptography.x509 import Certificate
@@ -59,10 +59,17 @@ def identity_of(config: ZenohConfig, bench: str, process: str) -> Identity | Non
     """The identity of a process, or None on a bench without TLS. Raises Unavailable, in one line, when it cannot be used."""
     if config.tls is None:
         return None
-    name = process if process in RIGHTS else _person(config.tls)
+    name = _name_of(config.tls, process)
     warning = check_identity(Path(config.tls.folder), bench, name)
     rights = rights_of(name, config.tls.operators, config.tls.guests)
     return Identity(name, rights, settings(config.tls, bench, name), warning)
+
+
+def _name_of(tls: TlsConfig, process: str) -> str:
+    """The identity of a process of the rig, of a launcher, or of a person's command."""
+    if process.startswith(f"{LAUNCHER}-"):
+        return FOLLOWER
+    return process if process in RIGHTS else _person(tls)
 
 
 def _person(tls: TlsConfig) -> str:

@@ -13,16 +13,20 @@ from typing import Any
 from softloop.wire.channels import (
     ARM,
     CAN,
+    CLOCK,
     COMMAND,
     CYCLE,
     EVENT,
     FAULT,
+    HOST,
+    HOSTS_ROOT,
     INCLINATION,
     PACE_ROOT,
     PRESSURE,
     REQUEST,
     ROOT,
     STATUS,
+    TIME,
     TRUTH,
     VALVES,
 )
@@ -31,8 +35,11 @@ from softloop.wire.channels import (
 RECORDER, MONITOR, PLANT, GATE, PRESSURES, INCLINOMETER, CONTROLLER = (
     "recorder", "monitor", "plant", "valves", "pressures", "inclinometer", "controller",
 )  # fmt: skip
-LAUNCHER = "launcher"
+LAUNCHER = "launcher"  # the one that leads, or the only one
+FOLLOWER = "follower"  # the launcher of every other host, `launcher-<host>` on the wire
 ROUTER = "router"  # whoever is the meeting point
+
+DOCTOR_ROOT = "softloop-doctor"  # where `softloop doctor` measures a way there and back
 
 ALL = "**"
 BUSES = "buses/*/*"  # who is on a CAN bus
@@ -71,29 +78,27 @@ class Rights:
 
 
 _TELL = (EVENT.name, STATUS.name)
+_HEAR = (VALVES.name, CLOCK.name)  # every process: when the gate is armed (`[faults]`), and what time it is
+_WATCH = (CYCLE.name, PRESSURE.name, STATUS.name, EVENT.name, *_HEAR)
 _ON_BUS = {"asks": (BUSES,), "answers": (BUSES,)}
 
 RIGHTS = {
-    CONTROLLER: Rights(puts=(COMMAND.name, CYCLE.name, *_TELL), hears=(PRESSURE.name, INCLINATION.name, VALVES.name)),
+    CONTROLLER: Rights(puts=(COMMAND.name, CYCLE.name, *_TELL), hears=(PRESSURE.name, INCLINATION.name, *_HEAR)),
     # All frames: it sends the valve frame, and copies the driver's and the bus's errors for the log.
-    GATE: Rights(
-        puts=(VALVES.name, FRAMES, *_TELL), hears=(COMMAND.name, REQUEST.name, ARM.name, VALVES.name, FRAMES), **_ON_BUS
-    ),
+    GATE: Rights(puts=(VALVES.name, FRAMES, *_TELL), hears=(COMMAND.name, REQUEST.name, ARM.name, FRAMES, *_HEAR), **_ON_BUS),
     # The analogue frame: the copy for the log, where the bus is none on Zenoh.
-    PRESSURES: Rights(puts=(PRESSURE.name, ANALOG_FRAME, *_TELL), hears=(VALVES.name, FRAMES), **_ON_BUS),
-    INCLINOMETER: Rights(puts=(INCLINATION.name, *_TELL), hears=(VALVES.name,)),
+    PRESSURES: Rights(puts=(PRESSURE.name, ANALOG_FRAME, *_TELL), hears=(FRAMES, *_HEAR), **_ON_BUS),
+    INCLINOMETER: Rights(puts=(INCLINATION.name, *_TELL), hears=_HEAR),
     PLANT: Rights(
         puts=(TRUTH.name, DRIVER_FRAME, ANALOG_FRAME, *_TELL),
-        hears=(VALVES.name, FRAMES),
+        hears=(FRAMES, *_HEAR),
         asks=(BUSES,),
         answers=(BUSES, FAULT.name),
     ),
     RECORDER: Rights(puts=_TELL, hears=(ALL,)),
-    MONITOR: Rights(puts=(REQUEST.name, *_TELL), hears=(CYCLE.name, VALVES.name)),
-    LAUNCHER: Rights(
-        puts=(REQUEST.name, ARM.name, EVENT.name),
-        hears=(CYCLE.name, VALVES.name, PRESSURE.name, STATUS.name, EVENT.name),
-    ),
+    MONITOR: Rights(puts=(REQUEST.name, *_TELL), hears=(CYCLE.name, *_HEAR)),
+    LAUNCHER: Rights(puts=(REQUEST.name, ARM.name, EVENT.name, CLOCK.name), hears=_WATCH),
+    FOLLOWER: Rights(puts=(REQUEST.name, EVENT.name, CLOCK.name), hears=_WATCH),
     ROUTER: Rights(puts=(ALL,), hears=(ALL,), asks=(ALL,), answers=(ALL,)),
 }
 # People and their programs. Whoever has an identity may stop the rig; arming, and breaking the simulated rig, is the operators'.
@@ -131,9 +136,7 @@ def access_control(bench: str, operators: Collection[str], guests: Collection[st
 def _rules(bench: str, identity: str, rights: Rights) -> list[dict[str, Any]]:
     """The rules for the links to one identity: ingress is what it sends, egress what it is sent."""
     head, pace = f"{ROOT}/{bench}", f"{PACE_ROOT}/{bench}"
-    transit = identity == ROUTER
-    alive, own = f"{head}/alive/*", "*" if transit else identity
-    everything = [f"{head}/{ALL}", f"{pace}/{ALL}"]
+    own, alive = _own_name(identity), f"{head}/alive/*"
     rules: list[dict[str, Any]] = []
 
     def rule(flow: str, messages: list[str], keys: Sequence[str]) -> None:
@@ -145,19 +148,37 @@ def _rules(bench: str, identity: str, rights: Rights) -> list[dict[str, Any]]:
         return [f"{head}/{part}" for part in parts]
 
     hears, answers, asks = below(rights.hears), below(rights.answers), below(rights.asks)
-    rule("ingress", ["put"], [*below(rights.puts), f"{pace}/*/{own}"])
-    rule("ingress", ["declare_subscriber"], [*hears, f"{pace}/*/*"])
-    rule("ingress", ["query"], asks)
-    rule("ingress", ["declare_queryable", "reply"], answers)
+    words, tells_time, asks_time = _between_hosts(bench, identity)
+    rule("ingress", ["put"], [*below(rights.puts), f"{pace}/*/{own}", *words])
+    rule("ingress", ["declare_subscriber"], [*hears, f"{pace}/*/*", *words])
+    rule("ingress", ["query"], [*asks, *asks_time])
+    rule("ingress", ["declare_queryable", "reply"], [*answers, *tells_time])
     rule("ingress", ["liveliness_token"], [f"{head}/alive/{own}"])
     rule("ingress", ["liveliness_query", "declare_liveliness_subscriber"], [alive])
-    rule("egress", ["put"], [*hears, f"{pace}/*/*"])
-    rule("egress", ["query"], answers)
-    rule("egress", ["reply"], asks)
+    rule("egress", ["put"], [*hears, f"{pace}/*/*", *words])
+    rule("egress", ["query"], [*answers, *tells_time])
+    rule("egress", ["reply"], [*asks, *asks_time])
     rule("egress", ["liveliness_token", "liveliness_query", "declare_liveliness_subscriber"], [alive])
     # Who listens, and who answers, is no secret among identities: a publisher is told of subscriptions wider than its key.
+    everything = [f"{root}/{bench}/{ALL}" for root in (ROOT, PACE_ROOT, HOSTS_ROOT, DOCTOR_ROOT)]
     rule("egress", ["declare_subscriber", "declare_queryable"], everything)
     return rules
+
+
+def _own_name(identity: str) -> str:
+    """By which names an identity's process shows that it is alive."""
+    return {ROUTER: "*", FOLLOWER: f"{LAUNCHER}-$*"}.get(identity, identity)
+
+
+def _between_hosts(bench: str, identity: str) -> tuple[list[str], list[str], list[str]]:
+    """Keys that are not below the bench's own: words that an identity says and hears, where it tells the time, where it asks."""
+    words, time = [f"{HOSTS_ROOT}/{bench}/{HOST.name}/*"], [f"{HOSTS_ROOT}/{bench}/{TIME}"]
+    doctor = [f"{DOCTOR_ROOT}/{bench}/*"]
+    if identity == ROUTER:
+        return [*words, *doctor], time, time
+    if identity in (LAUNCHER, FOLLOWER):
+        return words, time if identity == LAUNCHER else [], time
+    return (doctor if identity not in RIGHTS else []), [], []
 
 
 def _matches(expression: str, part: str) -> bool:

@@ -22,7 +22,7 @@ from softloop.wire.channels import ROOT, Channel, alive_key, key
 from softloop.wire.config import TLS, ZenohConfig
 from softloop.wire.errors import Unavailable
 from softloop.wire.identity import Identity, identity_of
-from softloop.wire.rights import ROUTER
+from softloop.wire.rights import RIGHTS, ROUTER
 
 UNIX = "unixsock-stream/"
 CLIENT_PATIENCE_MS = 10_000
@@ -41,7 +41,22 @@ def make_config(
 ) -> zenoh.Config:
     """The one way to a Zenoh configuration: nothing is left to Zenoh's defaults that reaches beyond this machine."""
     config = zenoh.Config()
-    settings: dict[str, Any] = {
+    for name, value in settings_of(mode, listen, connect, lease_ms, listen_must_work=listen_must_work, identity=identity).items():
+        config.insert_json5(name, json.dumps(value))
+    return config
+
+
+def settings_of(
+    mode: str,
+    listen: list[str],
+    connect: list[str],
+    lease_ms: int,
+    *,
+    listen_must_work: bool = True,
+    identity: Identity | None = None,
+) -> dict[str, Any]:
+    """The settings in `make_config`, by the path of each."""
+    return (identity.settings if identity else {}) | {
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
@@ -64,10 +79,6 @@ def make_config(
         "timestamping/enabled": False,
         "adminspace/enabled": False,
     }
-    settings |= {} if identity is None else identity.settings
-    for name, value in settings.items():
-        config.insert_json5(name, json.dumps(value))
-    return config
 
 
 def _patience_ms(mode: str, *, listen_must_work: bool) -> int:
@@ -81,11 +92,14 @@ def _patience_ms(mode: str, *, listen_must_work: bool) -> int:
     return -1 if listen_must_work else 0
 
 
-def own_endpoint(meeting_point: str, process: str) -> str:
-    """Where a peer listens for direct links: beside the meeting point, on a socket or port of its own."""
+def own_endpoint(meeting_point: str, process: str, address: str = "") -> str:
+    """Where a peer listens for direct links: beside the meeting point, or at `address`, on a socket or port of its own."""
     if meeting_point.startswith(UNIX):
         folder = Path(meeting_point[len(UNIX) :]).parent
         return f"{UNIX}{folder}/{Path(meeting_point).stem}.{process}.{os.getpid()}.sock"
+    if address:
+        shown = f"[{address}]" if ":" in address and not address.startswith("[") else address
+        return f"{meeting_point.split('/', 1)[0]}/{shown}:0"
     return meeting_point.rsplit(":", 1)[0] + ":0"
 
 
@@ -105,8 +119,8 @@ def _known(config: ZenohConfig, bench: str, process: str) -> Identity | None:
 def _open_as(identity: Identity | None, config: ZenohConfig, bench: str, process: str) -> zenoh.Session:
     meet = config.meeting_point(bench)
     # A person's certificate is none to be connected to.
-    peer = config.mode == "peer" and (identity is None or identity.name == process)
-    listen = [own_endpoint(meet, process)] if peer else []
+    peer = config.mode == "peer" and (identity is None or identity.name in RIGHTS)
+    listen = [own_endpoint(meet, process, config.listen)] if peer else []
     return _open(make_config("peer" if peer else "client", listen, [meet], config.lease_ms, identity=identity), meet)
 
 

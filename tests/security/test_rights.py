@@ -22,7 +22,7 @@ def test_the_sentences_of_the_documentation():
     assert who_may_put(COMMAND.name) == {"controller"}
     assert who_may_put(f"can/can0/{can_frames.VALVE_COMMAND_ID:x}") == {"valves"}
     assert who_may_put(ARM.name) == {"launcher", "ann"}
-    assert who_may_put(REQUEST.name) == {"launcher", "monitor", "ann", "gus"}
+    assert who_may_put(REQUEST.name) == {"launcher", "follower", "monitor", "ann", "gus"}
     assert who_may_put(VALVES.name) == {"valves"}
     assert {one for one in EVERYBODY if r.rights_of(one, **PEOPLE).may_ask(FAULT.name)} - {r.ROUTER} == {"ann"}
 
@@ -42,7 +42,7 @@ def test_frames_of_the_dbc_have_the_senders_of_the_dbc():
 
 
 def test_the_table_knows_every_process_and_whoever_it_does_not_know_may_nothing():
-    assert set(r.RIGHTS) == {*PROCESS_NAMES, "launcher", "router"}
+    assert set(r.RIGHTS) == {*PROCESS_NAMES, "launcher", "follower", "router"}
     assert r.rights_of("nobody", **PEOPLE) == r.Rights()
     assert r.rights_of("ann", [], []) == r.Rights()
 
