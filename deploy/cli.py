@@ -299,6 +299,22 @@ def router(
     return EXIT_OK
 
 
+@app.command()
+def keys(
+    bench: BenchArgument,
+    renew: Annotated[bool, typer.Option("--renew", help="Make anew what is there.")] = False,
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="This one alone; several by giving it again.")] = None,
+    authority: Annotated[bool, typer.Option("--authority", help="With --renew: the authority too; older keys are void.")] = False,
+    days: Annotated[int | None, typer.Option(metavar="N", min=1, max=3650, help="Instead of [zenoh.tls] valid_days.")] = None,
+) -> int:
+    """Make the certificate authority and the identities of a bench with [zenoh.tls]; what is there stays, unless --renew."""
+    from softloop.deploy.keys import make_keys
+
+    if authority and (not renew or only):
+        raise BadConfig("keys: --authority goes with --renew, and makes everybody's keys anew")
+    return make_keys(bench, renew=renew, only=only or (), authority=authority, days=days)
+
+
 @app.command(hidden=True)
 def prepare(bench: BenchArgument, run_dir: RunDir) -> int:
     """The launcher's helper: compile, check, and put parameters into the run's directory; JSON lines on standard output."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field, field_validator
 
 from softloop.wire.benchfile import Table
-from softloop.wire.config import loopback
+from softloop.wire.config import ip
 
 
 class RunConfig(Table):
@@ -37,5 +37,5 @@ class MachineConfig(Table):
 
     @field_validator("address")
     @classmethod
-    def _stays_on_this_machine(cls, value: str) -> str:
-        return loopback(value)
+    def _is_an_address(cls, value: str) -> str:
+        return ip(value)

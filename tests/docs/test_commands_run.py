@@ -27,7 +27,7 @@ STOP = ["request", "sim", "stop"]
 FIRST = ["run", "sim", "--page", "--run-dir", "runs/first"]
 SECOND = ["run", "pid.toml", "--run-dir", "runs/second"]
 BESIDE = ("top", "echo", "page", "foxglove", "request")
-ON_LOGS = ("plot", "report", "compare", "replay")
+ON_LOGS = ("plot", "report", "compare", "replay", "keys")
 ELSEWHERE = ("doctor", "install", "log")  # in tests of their own
 STANDS_FOR = {"runs/<run>": "runs/first", "runs/RUN": "runs/first", "runs/RUN_A": "runs/first", "runs/RUN_B": "runs/second"}
 # What is long in the documentation is short here: these words are added, or stand in for others.
@@ -76,6 +76,8 @@ class Place:
         (folder / "pid.toml").write_text(text)
         text = re.search(r"^```toml\n(.*?)^```", (ROOT / "docs" / "faults.md").read_text(), re.S | re.M)[1]
         (folder / "bad_cable.toml").write_text(text)
+        text = re.search(r"^```toml\n(.*?)^```", (ROOT / "docs" / "security.md").read_text(), re.S | re.M)[1]
+        (folder / "rig.toml").write_text(text)
 
     def start(self, words, output):
         command = [sys.executable, "-m", "softloop.deploy.cli", *words]
