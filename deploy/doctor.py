@@ -21,6 +21,7 @@ from softloop.deploy.doctor_check import Check, worst
 from softloop.deploy.doctor_clock import clock, clock_source, day_error_ms, offset
 from softloop.deploy.doctor_devices import devices, is_real
 from softloop.deploy.doctor_host import disk, existing, lateness, library_versions, permissions, zenoh
+from softloop.deploy.doctor_identity import identities
 from softloop.deploy.hosts import choose_host, shares
 from softloop.deploy.launcher import stop_on_signals
 from softloop.deploy.prepare import prepare_in_child
@@ -79,7 +80,7 @@ def examine(bench_file: Path, run_dir: Path, seconds: float, host: str = "") -> 
         checks += devices(bench, run_dir, wire, seconds, own)
     folder = existing(Path(bench.run.folder))
     clocks = [clock(clock_source(), day_error_ms()), *([offset(whole, host, seconds)] if host else [])]
-    return [*checks, *clocks, *disk(bench, folder, recorded="recorder" in own), library_versions()]
+    return [*checks, *identities(whole, host), *clocks, *disk(bench, folder, recorded="recorder" in own), library_versions()]
 
 
 def alone(bench: Bench) -> Bench:

@@ -10,7 +10,7 @@ from typing import Any
 
 from softloop.deploy.bench import Bench
 from softloop.deploy.doctor_check import Check, Verdict
-from softloop.deploy.hosts import leader, number_of, on_host
+from softloop.deploy.hosts import launcher_name, leader, number_of, on_host
 from softloop.wire.clock_config import ClockConfig
 from softloop.wire.clock_offset import Exchange
 from softloop.wire.errors import SoftloopError
@@ -81,7 +81,7 @@ def _unknown(bench: Bench, why: str) -> Check:
 def exchanged(bench: Bench, host: str, seconds: float) -> list[Exchange]:
     """Questions for the time, each `[clock] period_ms`, and their answers. Raises Unavailable when there is no way to ask."""
     found: list[Exchange] = []
-    with open_wire(on_host(bench, host).zenoh, bench.name, f"doctor-{host}") as wire:
+    with open_wire(on_host(bench, host).zenoh, bench.name, launcher_name(bench, host)) as wire:  # who has the right to ask
         wire.settle(lambda: False)
         question, end_s = TimeQuestion(wire), time.monotonic() + seconds
         while time.monotonic() < end_s:

@@ -1,6 +1,8 @@
 """What the doctor makes of what it sees: each verdict on made-up findings, on both sides of its limit."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 from tests.wire.rendezvous import meeting
@@ -12,6 +14,7 @@ from softloop.deploy.doctor_can import STUCK_SAMPLES, Heard, answering, at_rest,
 from softloop.deploy.doctor_check import Check, judged, worst
 from softloop.deploy.doctor_clock import clock, clock_source, day_error_ms, judge_offset, offset
 from softloop.deploy.doctor_devices import bus_is_simulated, buses_of, inclinometer_is_simulated, is_real
+from softloop.deploy.doctor_identity import identities, judge_identities, needed_here
 from softloop.deploy.doctor_inclinometer import _nothing_usable, judge_samples
 from softloop.deploy.hosts import shares
 from softloop.deploy.rotate import MIB, RunFolder
@@ -368,6 +371,32 @@ def test_an_offset_must_be_known_well_and_not_jump():
     assert (good.verdict, good.measured["offset_ms"]) == ("pass", pytest.approx(5.0, abs=0.01))
     assert judge_offset(config, exchanges(delay_ms=10.0), 0).verdict == "fail"
     assert judge_offset(config, exchanges(step_ms=50.0), 0).verdict == "fail"
+
+
+def test_identities_that_are_missing_are_each_named(bench, tmp_path):
+    assert identities(bench()) == []
+    assert needed_here(bench(HOSTS), "board") == ["plant", "valves", "pressures", "inclinometer", "follower"]
+    assert needed_here(bench(HOSTS), "desk") == ["recorder", "controller", "launcher", "router"]
+    check = judge_identities(tmp_path, "examined", ["valves", "launcher"])
+    assert (check.verdict, check.measured["unusable"]) == ("fail", 2)
+    assert "softloop keys" in check.do
+
+
+def test_identities_that_softloop_keys_made_are_usable(tmp_path):
+    file = tmp_path / "secured.toml"
+    file.write_text(
+        'base = "' + str(shipped_benches()["sim"]) + '"\nname = "secured"\n[zenoh]\nendpoint = "tls/127.0.0.1:7447"\n'
+        f'[zenoh.tls]\nfolder = "{tmp_path}/keys"\n'
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "softloop.deploy.cli", "keys", str(file)], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    (check,) = identities(load_bench(file, tmp_path))
+    assert check.verdict == "pass", check.found
+    (tmp_path / "keys" / "valves.key").chmod(0o644)
+    (check,) = identities(load_bench(file, tmp_path))
+    assert (check.verdict, check.measured["unusable"], "valves.key" in check.found) == ("fail", 1, True)
 
 
 # --- what a person and a log get
