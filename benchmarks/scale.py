@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import os
 import signal
 import subprocess
@@ -43,7 +44,7 @@ class Row:
         skipped, faults: ticks left out and gate faults, of all.
         late_p99_us, late_max_us: tick lateness of the worst rig. plant_late_ms: of the worst plant.
         cores: CPU seconds per second, of all. mib: unshared memory of all.
-        by_process: process -> CPU seconds per second and rig.
+        by_process: process -> CPU seconds per second and rig. These three are not known when a rig ended before its time.
     """
 
     rigs: int
@@ -163,6 +164,7 @@ def measure(count: int, seconds: float) -> Row:
         time.sleep(0.5 * seconds)
         after, took_s = spent(processes), time.monotonic() - began_s
         mib = unshared_mib(processes)
+        all_ran = all(rig.poll() is None for rig in rigs.all)
         rigs.end()
         summaries = [_summary(rigs, k) for k in range(count)]
     used = {pid: (after[pid] - before[pid]) / took_s for pid in after if pid in before}
@@ -170,6 +172,8 @@ def measure(count: int, seconds: float) -> Row:
     for pid, cores in used.items():
         name = processes[pid][0]
         by_process[name] = by_process.get(name, 0.0) + (cores if name == "router" else cores / count)
+    if not all_ran:  # what is left when a rig has ended is no cost of that many
+        return _row(summaries, math.nan, math.nan, {})
     return _row(summaries, sum(used.values()), mib, by_process)
 
 
@@ -207,6 +211,7 @@ def show(rows: list[Row]) -> None:
     for head in (
         "rigs",
         "hold 5 ms",
+        "valid",
         "skipped",
         "faults",
         "late p99 us",
