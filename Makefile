@@ -11,7 +11,7 @@ SOURCES := wire dynamics devices plant controller watch offline deploy tests ben
 
 CHROMIUM ?= /usr/bin/chromium
 
-.PHONY: help setup demo test exact test-page test-docs kill mutate fuzz monitor rearm lint lock clean
+.PHONY: help setup demo test exact test-page test-docs kill mutate fuzz monitor rearm flood lint lock clean
 
 help:
 	@echo 'make demo   set up, then run the two demonstration trajectories on the simulated rig'
@@ -20,7 +20,7 @@ help:
 	@echo 'make test-page  the live page in a real browser (Debian: apt install chromium)'
 	@echo 'make test-docs  every command of the documentation, run'
 	@echo 'make docs   the documentation as pages, in docs/_build/html'
-	@echo 'make kill, make mutate, make fuzz, make monitor, make rearm   the long campaigns, see docs/campaigns.md'
+	@echo 'make kill, make mutate, make fuzz, make monitor, make rearm, make flood   the long campaigns, see docs/campaigns.md'
 	@echo 'make lint   ruff, mypy and the rules of who may import whom'
 	@echo 'make lock   compute requirements.lock again from pyproject.toml'
 	@echo 'make clean  remove the environment, caches and built files; runs/ stays'
@@ -72,6 +72,10 @@ monitor: $(STAMP)
 rearm: $(STAMP)
 	$(BIN)/softloop warm
 	$(BIN)/python -m tests.campaigns.rearm
+
+flood: $(STAMP)
+	$(BIN)/softloop warm
+	$(BIN)/python -m tests.campaigns.flood
 
 exact: $(STAMP)
 	$(BIN)/softloop warm

@@ -31,6 +31,9 @@ def run(
         Path | None,
         typer.Option(metavar="SCENARIO.toml", help="Let things go wrong, and judge how that ends; see `softloop faults`."),
     ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="What `softloop doctor --certificate` wrote: into the log.")
+    ] = None,
 ) -> int:
     """Run a bench: start its processes, arm, watch, vent, stop, summary and report."""
     from softloop.deploy.bench import find_bench
@@ -38,8 +41,9 @@ def run(
 
     report = False if no_report else None
     options = Options(
-        run_dir=run_dir, duration_s=duration, report=report, quiet=quiet, pace=pace, page=page, foxglove=foxglove, host=host
-    )
+        run_dir=run_dir, duration_s=duration, report=report, quiet=quiet, pace=pace, page=page, foxglove=foxglove,
+        certificate=certificate, host=host,
+    )  # fmt: skip
     if faults is not None:
         from softloop.deploy.faults import run_with_faults
 
@@ -295,6 +299,22 @@ def router(
     return EXIT_OK
 
 
+@app.command()
+def keys(
+    bench: BenchArgument,
+    renew: Annotated[bool, typer.Option("--renew", help="Make anew what is there.")] = False,
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="This one alone; several by giving it again.")] = None,
+    authority: Annotated[bool, typer.Option("--authority", help="With --renew: the authority too; older keys are void.")] = False,
+    days: Annotated[int | None, typer.Option(metavar="N", min=1, max=3650, help="Instead of [zenoh.tls] valid_days.")] = None,
+) -> int:
+    """Make the certificate authority and the identities of a bench with [zenoh.tls]; what is there stays, unless --renew."""
+    from softloop.deploy.keys import make_keys
+
+    if authority and (not renew or only):
+        raise BadConfig("keys: --authority goes with --renew, and makes everybody's keys anew")
+    return make_keys(bench, renew=renew, only=only or (), authority=authority, days=days)
+
+
 @app.command(hidden=True)
 def prepare(bench: BenchArgument, run_dir: RunDir) -> int:
     """The launcher's helper: compile, check, and put parameters into the run's directory; JSON lines on standard output."""
@@ -306,7 +326,8 @@ def prepare(bench: BenchArgument, run_dir: RunDir) -> int:
 
 
 # After these in the list of commands; each enters itself.
-import softloop.deploy.cli_campaigns  # noqa: E402, F401
+import softloop.deploy.cli_campaigns  # noqa: E402
+import softloop.deploy.cli_machine  # noqa: E402, F401
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field, field_validator
 
 from softloop.wire.benchfile import Table
-from softloop.wire.config import loopback
+from softloop.wire.config import ip
 
 
 class RunConfig(Table):
@@ -26,6 +26,7 @@ class RunConfig(Table):
     stop_timeout_s: float = Field(5.0, gt=0, description="a process that has not ended by then is killed")
     rig: str = Field("", max_length=80, description="which rig this is, for parameter files; default: the bench's name")
     foreign_parameters: bool = Field(False, description="run on a parameter file that was identified on another rig")
+    certificate: str = Field("", description="what `softloop doctor --certificate` wrote for this bench: it goes into the log")
     report: bool = Field(True, description="write report.html and its pictures at the end")
 
 
@@ -36,5 +37,5 @@ class MachineConfig(Table):
 
     @field_validator("address")
     @classmethod
-    def _stays_on_this_machine(cls, value: str) -> str:
-        return loopback(value)
+    def _is_an_address(cls, value: str) -> str:
+        return ip(value)

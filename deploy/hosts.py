@@ -7,6 +7,7 @@ import json
 import re
 from typing import TYPE_CHECKING
 
+from softloop.wire.config import is_loopback
 from softloop.wire.errors import BadConfig
 from softloop.wire.messages import message, message_names
 
@@ -93,7 +94,13 @@ def check_hosts(bench: Bench) -> None:
 
 
 def _check_addresses(bench: Bench) -> None:
-    """What `{port}` and `{run_dir}` become differs from host to host."""
+    """Off this machine only with TLS; and what `{port}` and `{run_dir}` become differs from host to host."""
+    for host, machine in bench.hosts.items():
+        if machine.address and bench.zenoh.tls is None and not is_loopback(machine.address):
+            raise BadConfig(
+                f"key 'hosts.{host}.address': must be a loopback address, such as 127.0.0.2, or the bench have [zenoh.tls]; "
+                "see docs/security.md"
+            )
     if any(text in bench.zenoh.endpoint for text in _OF_A_RUN):
         raise BadConfig("key 'zenoh.endpoint': {run_dir} and {port} differ from host to host; name a port")
     if bench.plant is None or bench.inclinometer is None or bench.plant.host == bench.inclinometer.host:

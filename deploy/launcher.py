@@ -6,7 +6,7 @@ import re
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -29,8 +29,9 @@ from softloop.deploy.node import KEPT_PROCESSES, STOP_ORDER, processes_of
 from softloop.deploy.prepare import prepare_in_child
 from softloop.deploy.progress import compile_progress
 from softloop.deploy.rig_state import GATE_FAULT, RigState
+from softloop.deploy.rotate import in_use, keeping_budget, make_room
 from softloop.deploy.router import launcher_wire, remove_sockets
-from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench, make_run_dir
+from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench, keep_certificate, make_run_dir
 from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, BadConfig
 from softloop.wire.session import Wire
 from softloop.wire.shell import Stop
@@ -61,6 +62,7 @@ class Options:
     pace: Literal["wall", "lockstep"] | None = None
     page: bool = False
     foxglove: bool = False
+    certificate: Path | None = None
     host: str | None = None
 
 
@@ -73,20 +75,25 @@ def launch(bench_file: Path, options: Options, then: Callable[..., int] = _concl
 
     Raises:
         BadFile, BadConfig: the bench file is wrong, or its trajectory not feasible.
-        Unavailable: the bench runs already, its address is in use, or the run directory cannot be made.
+        Unavailable: the bench runs already, its address is in use, its disk budget is used up, or the run directory cannot
+            be made.
     """
     bench = _with_options(load_bench(bench_file), options)
     host, same = choose_host(bench, options.host), digest(bench, folders_of(bench_file))
     if not processes_of(bench):
         raise BadConfig(f"{bench_file}: no process to run: it has none of the tables plant, valves, controller, ...")
-    with stop_on_signals() as stop, bench_lock(f"{bench.name}@{host}" if host else bench.name):
+    with stop_on_signals() as stop, bench_lock(f"{bench.name}@{host}" if host else bench.name), ExitStack() as held:
+        make_room(bench)
         run_dir = make_run_dir(bench, options.run_dir, host)
         bench = _with_options(load_bench(bench_file, run_dir), options)
         keep_bench(run_dir, bench)
+        held.enter_context(in_use(run_dir))
+        keep_certificate(run_dir, bench)
         with compile_progress(quiet=options.quiet) as progress:
             prepared = prepare_in_child(run_dir / BENCH_FILE, run_dir, stop, progress)
         with (
             closing(make_view(prepared.trajectory_s, quiet=options.quiet)) as view,
+            keeping_budget(bench, view.say),
             launcher_wire(bench, host, stop, view.say) as wire,
             closing(_fleet(bench, host, wire, same)) as fleet,
             beside(onlookers(run_dir, options), run_dir, view.say) as viewers,
@@ -116,11 +123,13 @@ def onlookers(run_dir: Path, options: Options) -> list[list[str]]:
 
 def _with_options(bench: Bench, options: Options) -> Bench:
     """The bench with what the command line changes."""
-    changed: dict[str, float | bool] = {}
+    changed: dict[str, float | bool | str] = {}
     if options.duration_s is not None:
         changed["duration_s"] = options.duration_s
     if options.report is not None:
         changed["report"] = options.report
+    if options.certificate is not None:
+        changed["certificate"] = str(options.certificate)
     paced = bench.pace if options.pace is None else bench.pace.model_copy(update={"mode": options.pace})
     return bench.model_copy(update={"run": bench.run.model_copy(update=changed), "pace": paced})
 

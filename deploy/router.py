@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
@@ -15,8 +17,10 @@ from softloop.deploy.hosts import launcher_name, leader, on_host, shares
 from softloop.deploy.zenohd import run_zenohd
 from softloop.wire.config import ZenohConfig
 from softloop.wire.errors import Interrupted, Lost, Unavailable
+from softloop.wire.identity import identity_of
+from softloop.wire.rights import ROUTER
 from softloop.wire.session import UNIX, Wire, open_router, open_session
-from softloop.wire.shell import Stop, prefer_realtime
+from softloop.wire.shell import Stop
 
 POLL_S = 0.1
 JOIN_S = 3.0  # joining takes well under a tenth of a second
@@ -34,9 +38,14 @@ def launcher_wire(bench: Bench, host: str = "", stop: Stop | None = None, say: C
     config = on_host(bench, host).zenoh
     joins = bench.run.shared_router or not leads
     patience_s = bench.run.hosts_wait_s if host else JOIN_S
-    session = _join(config, bench.name, name, patience_s, stop or Stop(), say) if joins else open_router(config, bench.name)
-    with session:
-        wire = Wire(session, bench.name, name)
+    identity = identity_of(config, bench.name, name) if joins else None  # the meeting point's own has no bounds
+    with ExitStack() as stack:
+        if joins:
+            session = stack.enter_context(_join(config, bench.name, name, patience_s, stop or Stop(), say))
+        else:
+            with _ahead(bench):
+                session = stack.enter_context(open_router(config, bench.name))
+        wire = Wire(session, bench.name, name, identity)
         if joins:
             _be_alone(wire, bench.zenoh.meeting_point(bench.name), _own_names(bench, host, name))
         wire.declare_alive()
@@ -102,6 +111,23 @@ def remove_sockets(bench: Bench, pid: int) -> None:
             left.unlink(missing_ok=True)
 
 
+@contextmanager
+def _ahead(bench: Bench) -> Iterator[None]:
+    """In mode client all of the 5 ms path passes the meeting point: what is started here has real-time priority, where granted.
+
+    A step below the loop's, so that whoever floods the meeting point does not keep the loop from its processor. What else this
+    process does stays as it was.
+    """
+    own = os.sched_getscheduler(0), os.sched_getparam(0)
+    if bench.zenoh.mode == "client" and bench.host.realtime_priority > 1:
+        with suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(bench.host.realtime_priority - 1))
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, *own)
+
+
 def run_router(bench: Bench, stop: Stop, program: str | None = None) -> None:
     """Be the meeting point until asked to stop, or let `program`, a zenohd, be it.
 
@@ -110,11 +136,16 @@ def run_router(bench: Bench, stop: Stop, program: str | None = None) -> None:
         Lost: zenohd ended by itself.
     """
     where = bench.zenoh.meeting_point(bench.name)
-    if bench.zenoh.mode == "client":  # all of the 5 ms path goes through here
-        prefer_realtime("router", bench.host)
-    with run_zenohd(program, bench.zenoh, where) if program else open_router(bench.zenoh, bench.name) as held:
+    with ExitStack() as stack:
+        with _ahead(bench):
+            held: Any = stack.enter_context(_zenohd(bench, program) if program else open_router(bench.zenoh, bench.name))
         by = f" ({program})" if program else ""
         print(f"meeting point of bench '{bench.name}': {where}{by}", flush=True)
         while not stop.wait(POLL_S):
             if isinstance(held, subprocess.Popen) and held.poll() is not None:
                 raise Lost(f"{program} ended with code {held.returncode}")
+
+
+def _zenohd(bench: Bench, program: str) -> AbstractContextManager[subprocess.Popen[bytes]]:
+    identity = identity_of(bench.zenoh, bench.name, ROUTER)
+    return run_zenohd(program, bench.zenoh, bench.zenoh.meeting_point(bench.name), identity)

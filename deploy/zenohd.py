@@ -14,6 +14,7 @@ from typing import Any
 
 from softloop.wire.config import ZenohConfig
 from softloop.wire.errors import Unavailable
+from softloop.wire.identity import Identity
 from softloop.wire.session import UNIX, settings_of
 
 POLL_S = 0.05
@@ -33,12 +34,14 @@ def find_zenohd(wanted: str) -> str | None:
 
 
 @contextmanager
-def run_zenohd(program: str, config: ZenohConfig, where: str) -> Iterator[subprocess.Popen[bytes]]:
+def run_zenohd(
+    program: str, config: ZenohConfig, where: str, identity: Identity | None = None
+) -> Iterator[subprocess.Popen[bytes]]:
     """Run zenohd with the settings of our own router and nothing else. Raises Unavailable when it does not come up."""
     if listens(where):
         raise Unavailable(f"Zenoh endpoint {where}: the address is in use; is this bench running already?")
     with tempfile.NamedTemporaryFile("w", prefix="softloop-zenohd-", suffix=".json5") as file:
-        json.dump(nested(settings_of("router", [where], [], config.lease_ms)), file)
+        json.dump(nested(settings_of("router", [where], [], config.lease_ms, identity=identity)), file)
         file.flush()
         with subprocess.Popen([program, "--config", file.name], stdin=subprocess.DEVNULL, start_new_session=True) as process:
             try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from ipaddress import ip_address
+from typing import Literal
 
 from pydantic import Field, model_validator
 
@@ -20,6 +21,10 @@ class RecorderConfig(ProcessTable):
     backlog_messages: int = Field(100_000, ge=1, le=10_000_000, description="messages waiting; beyond it the oldest go")
     unwritten_mib: int = Field(64, ge=1, le=4096, description="bytes the disk did not take yet; beyond it new messages go")
     drain_s: float = Field(3.0, ge=0, le=60, description="time allowed at the end for what is still waiting")
+    budget_mib: int = Field(0, ge=0, description="disk space for this bench's runs in [run] folder; 0: no limit")
+    over_budget: Literal["refuse", "remove"] = Field(
+        "refuse", description="refuse: no new run; remove: the oldest runs go, never one that is in use or holds a file `keep`"
+    )
 
 
 class MonitorConfig(ProcessTable):

@@ -34,7 +34,8 @@ PRESSURE = Channel("pressure", "PressureSample", 200.0, 20 * MS, realtime=True)
 INCLINATION = Channel("inclination", "InclinationSample", 200.0, 30 * MS, realtime=True)
 COMMAND = Channel("command", "ValveCommand", 200.0, 15 * MS, realtime=True)
 VALVES = Channel("valves", "ValveStatus", 200.0, 50 * MS, realtime=True)
-REQUEST = Channel("request", "GateRequest", 0.0)
+REQUEST = Channel("request", "GateRequest", 0.0)  # to disarm, stop, or go to FAULT: whoever has a right on the bench may ask
+ARM = Channel("arm", "GateRequest", 0.0)  # to arm, and nothing else: a key of its own, so that access rules can tell
 EVENT = Channel("event", "Event", 0.0)
 CYCLE = Channel("cycle", "CycleRecord", 200.0)
 TRUTH = Channel("truth", "PlantTruth", 200.0)
@@ -42,7 +43,7 @@ STATUS = Channel("status", "ProcessStatus", 1.0)
 CLOCK = Channel("clock", "ClockOffset", 10.0)  # with several hosts: from each but that of the controller
 CAN = Channel("can", "CanFrame", 600.0, realtime=True)  # key: can/<bus>/<arbitration id in hex>
 
-CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, EVENT, CYCLE, TRUTH, STATUS, CLOCK, CAN)
+CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, ARM, EVENT, CYCLE, TRUTH, STATUS, CLOCK, CAN)
 
 # Asked for and answered, not published (`wire.questions`): a fault for the simulated rig, answered by the plant alone.
 FAULT = Channel("fault", "FaultRequest", 0.0, logged=False)

@@ -32,7 +32,7 @@ METADATA_NAME = "softloop"
 LIBRARY = "softloop"
 CHUNK_BYTES = 64 * 1024  # closing a chunk of this size takes about a millisecond; one of 1 MiB takes fifteen
 # Attached from the run's directory when they stand there; versions.json and git.json are made here.
-RUN_FILES = ("bench.toml", "rig.dbc", "parameters.toml")
+RUN_FILES = ("bench.toml", "rig.dbc", "parameters.toml", "certificate.json")
 MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}
 LIBRARIES = ("softloop", "numpy", "numba", "eclipse-zenoh")
 # Channels on which several senders count for themselves, and the field that tells them apart.

@@ -91,7 +91,7 @@ def test_which_host_this_is_must_be_said(write):
         ('[controller]\nhost = "desk"', "[controller]", "key 'controller.host' is missing: this bench runs on the hosts bench, "),
         ("[hosts.log]", "[hosts.log]\n[hosts.idle]", "key 'hosts.idle': no process runs there"),
         ('address = "127.0.0.2"', 'address = "10.0.0.2"', "hosts.bench.address': must be a loopback address"),
-        ('address = "127.0.0.2"', 'address = "localhost"', "must be a loopback address"),
+        ('address = "127.0.0.2"', 'address = "localhost"', "must be an IP address"),
         ('[pressures]\nhost = "bench"', "[pressures]", "key 'pressures.host' is missing"),
         ('[inclinometer]\nhost = "bench"', '[inclinometer]\nhost = "log"', "key 'plant.serial': .* name a port"),
         ("[hosts.desk]", '[zenoh]\nendpoint = "tcp/127.0.0.1:{port}"\n[hosts.desk]', "key 'zenoh.endpoint': .* name a port"),

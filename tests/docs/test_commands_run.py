@@ -27,7 +27,8 @@ STOP = ["request", "sim", "stop"]
 FIRST = ["run", "sim", "--page", "--run-dir", "runs/first"]
 SECOND = ["run", "pid.toml", "--run-dir", "runs/second"]
 BESIDE = ("top", "echo", "page", "foxglove", "request")
-ON_LOGS = ("plot", "report", "compare", "replay")
+ON_LOGS = ("plot", "report", "compare", "replay", "keys")
+ELSEWHERE = ("doctor", "install", "log")  # in tests of their own
 STANDS_FOR = {"runs/<run>": "runs/first", "runs/RUN": "runs/first", "runs/RUN_A": "runs/first", "runs/RUN_B": "runs/second"}
 # What is long in the documentation is short here: these words are added, or stand in for others.
 LESS = {
@@ -75,6 +76,8 @@ class Place:
         (folder / "pid.toml").write_text(text)
         text = re.search(r"^```toml\n(.*?)^```", (ROOT / "docs" / "faults.md").read_text(), re.S | re.M)[1]
         (folder / "bad_cable.toml").write_text(text)
+        text = re.search(r"^```toml\n(.*?)^```", (ROOT / "docs" / "security.md").read_text(), re.S | re.M)[1]
+        (folder / "rig.toml").write_text(text)
 
     def start(self, words, output):
         command = [sys.executable, "-m", "softloop.deploy.cli", *words]
@@ -177,5 +180,5 @@ def test_on_what_is_there(place, command):
 
 def test_every_command_of_the_pages_is_among_these():
     """A new kind of command on a page is a new line here."""
-    assert {command[0] for _, command in ALL} <= {"run", "batch", "check", "faults", *BESIDE, *ON_LOGS}
+    assert {command[0] for _, command in ALL} <= {"run", "batch", "check", "faults", *BESIDE, *ON_LOGS, *ELSEWHERE}
     assert all(command in [command for _, command in ALL] for command in (FIRST, SECOND, STOP))
