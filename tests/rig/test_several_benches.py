@@ -19,7 +19,7 @@ from tests.rig.lockstep_benches import eventful
 from tests.rig.rigs import LIMIT_S, running
 from tests.wire.rendezvous import short_folder
 
-pytestmark = pytest.mark.rig
+pytestmark = pytest.mark.long
 
 SIM = shipped_benches()["sim"]
 NAMES = ("east", "west")
