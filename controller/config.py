@@ -94,7 +94,7 @@ class ObserverConfig(Table):
 
 
 class PressureConfig(Table):
-    """`[controller.pressure]`: step 2 alone."""
+    """`[controller.pressure]`: step 2 alone, in both laws that track a pressure."""
 
     k2: float = Field(30.0, gt=0, description="K_2, 1/s")
     epsilon2: float = Field(1.0e3, gt=0, description="kPa^2/s, Eq. 47")
@@ -104,8 +104,9 @@ class PressureConfig(Table):
 class ControllerConfig(Table):
     """`[controller]`: the law, its trajectory, and what it is told of delays and budgets."""
 
-    law: Literal["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure"] = Field(
-        "arc", description="C1, C1 with our observer, C2, C3, ours, or step 2 of C3 alone; each has its table below"
+    law: Literal["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure", "pressure_eso"] = Field(
+        "arc",
+        description="C1, C1 with our observer, C2, C3, ours, or step 2 of C3 alone, and that with our observer",
     )
     parameters: str = Field("table1", description="a shipped parameter set, or the path of a parameter file")
     trajectory: str = Field("t1", description="t1, t2, excitation_1hz, excitation_05hz, or the path of a CSV file t_s, value")

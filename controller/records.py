@@ -17,7 +17,7 @@ GATE_ARMED = constant("ValveStatus", "GATE_ARMED")
 OUTPUT_PASS = constant("ValveStatus", "OUTPUT_PASS")
 SAMPLE_OK = constant("PressureSample", "STATUS_OK")
 
-LAW_PID, LAW_ARC, LAW_PRESSURE, LAW_SMC, LAW_ARC_ESO, LAW_PID_ESO = 0, 1, 2, 3, 4, 5
+LAW_PID, LAW_ARC, LAW_PRESSURE, LAW_SMC, LAW_ARC_ESO, LAW_PID_ESO, LAW_PRESSURE_ESO = 0, 1, 2, 3, 4, 5, 6
 LAWS = {
     "pid": LAW_PID,
     "pid_eso": LAW_PID_ESO,
@@ -25,8 +25,11 @@ LAWS = {
     "arc": LAW_ARC,
     "arc_eso": LAW_ARC_ESO,
     "pressure": LAW_PRESSURE,
+    "pressure_eso": LAW_PRESSURE_ESO,
 }
-OBSERVED_LAWS = ("arc_eso", "pid_eso")  # these are given the observer's state, the others the newest samples carried on
+PRESSURE_LAWS = ("pressure", "pressure_eso")  # their trajectory is a pressure
+# These are given the observer's state, the others the newest samples carried on.
+OBSERVED_LAWS = ("arc_eso", "pid_eso", "pressure_eso")
 MODES_TABLE_2, MODES_FLOW_DEMAND, MODES_LATCHED = 0, 1, 2
 MODE_RULES = {"table2": MODES_TABLE_2, "flow": MODES_FLOW_DEMAND, "latched": MODES_LATCHED}
 

@@ -19,11 +19,11 @@ from softloop.controller.records import (
     CYCLE,
     GAINS,
     INPUTS,
-    LAW_PRESSURE,
     LAWS,
     MODE_HOLD,
     MODE_RULES,
     OBSERVED_LAWS,
+    PRESSURE_LAWS,
 )
 from softloop.controller.references import Plan
 from softloop.controller.tick import SCRATCH, controller_tick_of_arrays
@@ -69,11 +69,11 @@ def plan_of(config: ControllerConfig) -> Plan:
     name, seed = config.trajectory, config.trajectory_seed
     excitations = {"excitation_1hz": 1.0, "excitation_05hz": 0.5}
     if name in excitations:
-        if config.law != "pressure":
+        if config.law not in PRESSURE_LAWS:
             raise BadConfig(f"[controller] trajectory '{name}' is a pressure; it needs law = \"pressure\"")
         return references.excitation(excitations[name], seed)
     if name in ("t1", "t2"):
-        if config.law == "pressure":
+        if config.law in PRESSURE_LAWS:
             raise BadConfig(f"[controller] trajectory '{name}' is an angle; law \"pressure\" needs an excitation or a CSV in kPa")
         return references.point_to_point() if name == "t1" else references.t2(seed)
     path = Path(name)
@@ -89,7 +89,7 @@ def build(config: ControllerConfig, parameters: Parameters | None = None) -> Con
     """
     model = model_record(parameters or parameters_of(config))
     plan = plan_of(config)
-    (check_pressure_plan if config.law == "pressure" else check_angle_plan)(plan, model)
+    (check_pressure_plan if config.law in PRESSURE_LAWS else check_angle_plan)(plan, model)
     state = np.zeros(1, CONTROLLER_STATE)
     state[0].theta[:] = model.theta
     state[0].mode = MODE_HOLD
@@ -138,7 +138,7 @@ def gains_record(config: ControllerConfig, model: Any) -> Any:
     gains.actuation.flow_hold_kpa_s = actuation.flow_hold_kpa_s
     gains.actuation.error_hold, gains.actuation.error_release = actuation.error_hold_deg, actuation.error_release_deg
     gains.actuation.rate_still_deg_s = actuation.rate_still_deg_s
-    if LAWS[config.law] == LAW_PRESSURE:  # its error is a pressure and its trajectory never dwells
+    if config.law in PRESSURE_LAWS:  # its error is a pressure and its trajectory never dwells
         gains.actuation.rate_still_deg_s = -1.0
     gains.actuation.switch_ticks = actuation.switch_ticks
     gains.actuation.bias_fraction = actuation.bias_fraction

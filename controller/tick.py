@@ -39,6 +39,7 @@ from softloop.controller.records import (
     LAW_PID,
     LAW_PID_ESO,
     LAW_PRESSURE,
+    LAW_PRESSURE_ESO,
     LAW_SMC,
     MEASUREMENT,
     MEASUREMENT_TYPE,
@@ -102,7 +103,9 @@ def begin_approach(config: Any, model: Any, inputs: Any, knots: np.ndarray, tabl
     Nothing of what was learned before is kept: what led to a fault may have taught it.
     """
     reference_at(config.plan_kind, knots, table, 0.0, scratch.end)
-    start = inputs.pressure.chamber_pressure_kpa if config.law == LAW_PRESSURE else inputs.inclination.angle_deg
+    start = (
+        inputs.pressure.chamber_pressure_kpa if config.law in (LAW_PRESSURE, LAW_PRESSURE_ESO) else inputs.inclination.angle_deg
+    )
     move_between(start, scratch.end, 1e-9 * config.approach_ns, state.approach)
     state.phase = PHASE_APPROACH
     state.phase_start_ns = inputs.now_ns
@@ -158,7 +161,7 @@ def law_step(law: int, model: Any, measurement: Any, reference: Any, gains: Any,
         smc_step(model, measurement, reference, gains, state, first, demand)
     elif law == LAW_ARC_ESO:
         arc_eso_step(model, measurement, reference, gains, state, first, demand)
-    elif law == LAW_PRESSURE:
+    elif law in (LAW_PRESSURE, LAW_PRESSURE_ESO):
         pressure_step(measurement, reference, gains, state, demand)
 
 
@@ -212,7 +215,7 @@ def record_thoughts(config: Any, measurement: Any, reference: Any, demand: Any, 
     cycle.trajectory_ns = since_ns - (0 if on_plan else config.approach_ns)
     cycle.reference_deg, cycle.reference_rate_deg_s = reference.value, reference.rate
     cycle.reference_acceleration_deg_s2, cycle.reference_jerk_deg_s3 = reference.acceleration, reference.jerk
-    if config.law == LAW_PRESSURE:  # its trajectory is a pressure and stands in desired_pressure_kpa
+    if config.law in (LAW_PRESSURE, LAW_PRESSURE_ESO):  # its trajectory is a pressure and stands in desired_pressure_kpa
         cycle.reference_deg, cycle.reference_rate_deg_s = np.nan, np.nan
         cycle.reference_acceleration_deg_s2, cycle.reference_jerk_deg_s3 = np.nan, np.nan
     cycle.angle_estimate_deg, cycle.rate_estimate_deg_s = measurement.angle_deg, measurement.rate_deg_s

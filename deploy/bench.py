@@ -152,7 +152,7 @@ def monitor_process(table: MonitorConfig, controller: ControllerConfig) -> Monit
     """What the monitor is given of the controller's table."""
     gains = {"arc": controller.arc, "smc": controller.smc}.get(controller.law)
     law = None if gains is None else LawGains(**{f.name: getattr(gains, f.name) for f in fields(LawGains)})
-    return MonitorProcess(table, controller.parameters, law, controller.law != "pressure")
+    return MonitorProcess(table, controller.parameters, law, controller.law not in ("pressure", "pressure_eso"))
 
 
 def _check_together(bench: Bench, source: Source) -> None:

@@ -294,7 +294,8 @@ def prepare(bench: BenchArgument, run_dir: RunDir) -> int:
 
 
 # After these in the list of commands; each enters itself.
-import softloop.deploy.cli_campaigns  # noqa: E402, F401
+import softloop.deploy.cli_campaigns  # noqa: E402
+import softloop.deploy.cli_experiments  # noqa: E402, F401
 
 
 def main(arguments: list[str] | None = None) -> None:

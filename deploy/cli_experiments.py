@@ -1,0 +1,63 @@
+# ruff: noqa: PLC0415 - as in `deploy.cli`
+"""`softloop experiment ...` and `softloop reproduce`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from softloop.deploy.cli_app import EXIT_CODES, BenchArgument, app
+
+experiment_app = typer.Typer(help="Excite a bench's rig for identification, or let its laws track.", rich_markup_mode=None)
+app.add_typer(experiment_app, name="experiment")
+
+Out = Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/<bench>-<experiment>-<UTC time>.")]
+PaceOption = Annotated[
+    Literal["wall", "lockstep", "batch"] | None,
+    typer.Option(help="Instead of the bench file's; batch: in one process, the same messages as at lockstep pace."),
+]
+Parameters = Annotated[str | None, typer.Option(metavar="FILE.toml", help="Instead of the bench's, for the laws.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")]
+Seed = Annotated[int | None, typer.Option(metavar="N", min=0, help="Of the multi-sines' phases; default: the bench's.")]
+
+
+@experiment_app.command("pressure", epilog=EXIT_CODES)
+def pressure(
+    bench: BenchArgument,
+    out: Out = None,
+    pace: PaceOption = None,
+    parameters: Parameters = None,
+    seed: Seed = None,
+    law: Annotated[Literal["pressure", "pressure_eso"], typer.Option(help="The paper's step 2, or with our observer.")] = (
+        "pressure_eso"
+    ),
+    quiet: Quiet = False,
+) -> int:
+    """Run the pressure law on the [0, 1] and [0, 0.5] Hz multi-sines: Data1 to Data3; exit code 1 where it is off by over 2 kPa."""
+    from softloop.deploy.bench import find_bench
+    from softloop.deploy.experiment import Asked
+    from softloop.deploy.experiment_pressure import run_pressure
+
+    return run_pressure(Asked(find_bench(bench), out, pace, parameters, seed, quiet), law)
+
+
+@experiment_app.command("tracking", epilog=EXIT_CODES)
+def tracking(
+    bench: BenchArgument,
+    out: Out = None,
+    pace: PaceOption = None,
+    parameters: Parameters = None,
+    seed: Seed = None,
+    laws: Annotated[str, typer.Option(metavar="LAW,LAW", help="Which laws, in order.")] = "pid,smc,arc,arc_eso",
+    own_gains: Annotated[bool, typer.Option("--own-gains", help="The bench's gains, not each law's tuned ones.")] = False,
+    quiet: Quiet = False,
+) -> int:
+    """Run laws on T1 and T2, the paper's Figs. 6 and 7, and show their errors."""
+    from softloop.deploy.bench import find_bench
+    from softloop.deploy.experiment import Asked
+    from softloop.deploy.experiment_tracking import run_tracking
+
+    chosen = tuple(name.strip() for name in laws.split(",") if name.strip())
+    return run_tracking(Asked(find_bench(bench), out, pace, parameters, seed, quiet), chosen, own_gains=own_gains)
