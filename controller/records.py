@@ -18,6 +18,7 @@ OUTPUT_PASS = constant("ValveStatus", "OUTPUT_PASS")
 SAMPLE_OK = constant("PressureSample", "STATUS_OK")
 
 LAW_PID, LAW_ARC, LAW_PRESSURE, LAW_SMC, LAW_ARC_ESO, LAW_PID_ESO, LAW_PRESSURE_ESO = 0, 1, 2, 3, 4, 5, 6
+LAW_VALVE_TEST = 7
 LAWS = {
     "pid": LAW_PID,
     "pid_eso": LAW_PID_ESO,
@@ -26,7 +27,9 @@ LAWS = {
     "arc_eso": LAW_ARC_ESO,
     "pressure": LAW_PRESSURE,
     "pressure_eso": LAW_PRESSURE_ESO,
+    "valve_test": LAW_VALVE_TEST,
 }
+ANGLE_LAWS = ("pid", "pid_eso", "smc", "arc", "arc_eso")
 PRESSURE_LAWS = ("pressure", "pressure_eso")  # their trajectory is a pressure
 # These are given the observer's state, the others the newest samples carried on.
 OBSERVED_LAWS = ("arc_eso", "pid_eso", "pressure_eso")
@@ -127,6 +130,7 @@ OBSERVER_GAINS = record_dtype(
     ]
 )
 PRESSURE_GAINS = record_dtype([(n, "f8") for n in ("k2", "epsilon2", "delta2")])
+VALVE_TEST_GAINS = record_dtype([("top_kpa", "f8"), ("low_kpa", "f8")])
 GAINS = record_dtype(
     [
         ("actuation", ACTUATION),
@@ -136,6 +140,7 @@ GAINS = record_dtype(
         ("smc", ARC_GAINS),
         ("arc_eso", ARC_ESO_GAINS),
         ("observer", OBSERVER_GAINS),
+        ("valve_test", VALVE_TEST_GAINS),
     ]
 )
 

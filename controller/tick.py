@@ -14,6 +14,7 @@ from softloop.controller.laws.arc_eso import arc_eso_step
 from softloop.controller.laws.pid import pid_step
 from softloop.controller.laws.pressure import pressure_step
 from softloop.controller.laws.smc import smc_step
+from softloop.controller.laws.valve_test import valve_test_step
 from softloop.controller.observer import begin_observer, observe
 from softloop.controller.records import (
     CONFIG_TYPE,
@@ -41,6 +42,7 @@ from softloop.controller.records import (
     LAW_PRESSURE,
     LAW_PRESSURE_ESO,
     LAW_SMC,
+    LAW_VALVE_TEST,
     MEASUREMENT,
     MEASUREMENT_TYPE,
     MODE_HOLD,
@@ -103,9 +105,11 @@ def begin_approach(config: Any, model: Any, inputs: Any, knots: np.ndarray, tabl
     Nothing of what was learned before is kept: what led to a fault may have taught it.
     """
     reference_at(config.plan_kind, knots, table, 0.0, scratch.end)
-    start = (
-        inputs.pressure.chamber_pressure_kpa if config.law in (LAW_PRESSURE, LAW_PRESSURE_ESO) else inputs.inclination.angle_deg
-    )
+    start = inputs.inclination.angle_deg
+    if config.law in (LAW_PRESSURE, LAW_PRESSURE_ESO):
+        start = inputs.pressure.chamber_pressure_kpa
+    elif config.law == LAW_VALVE_TEST:  # a current
+        start = 0.0
     move_between(start, scratch.end, 1e-9 * config.approach_ns, state.approach)
     state.phase = PHASE_APPROACH
     state.phase_start_ns = inputs.now_ns
@@ -163,6 +167,8 @@ def law_step(law: int, model: Any, measurement: Any, reference: Any, gains: Any,
         arc_eso_step(model, measurement, reference, gains, state, first, demand)
     elif law in (LAW_PRESSURE, LAW_PRESSURE_ESO):
         pressure_step(measurement, reference, gains, state, demand)
+    elif law == LAW_VALVE_TEST:
+        valve_test_step(measurement, reference, gains, state, demand)
 
 
 @kernel(types.void(STATE_TYPE, DEMAND_TYPE))
@@ -215,7 +221,8 @@ def record_thoughts(config: Any, measurement: Any, reference: Any, demand: Any, 
     cycle.trajectory_ns = since_ns - (0 if on_plan else config.approach_ns)
     cycle.reference_deg, cycle.reference_rate_deg_s = reference.value, reference.rate
     cycle.reference_acceleration_deg_s2, cycle.reference_jerk_deg_s3 = reference.acceleration, reference.jerk
-    if config.law in (LAW_PRESSURE, LAW_PRESSURE_ESO):  # its trajectory is a pressure and stands in desired_pressure_kpa
+    # A pressure stands in desired_pressure_kpa, a current in the command.
+    if config.law in (LAW_PRESSURE, LAW_PRESSURE_ESO, LAW_VALVE_TEST):
         cycle.reference_deg, cycle.reference_rate_deg_s = np.nan, np.nan
         cycle.reference_acceleration_deg_s2, cycle.reference_jerk_deg_s3 = np.nan, np.nan
     cycle.angle_estimate_deg, cycle.rate_estimate_deg_s = measurement.angle_deg, measurement.rate_deg_s
@@ -275,9 +282,9 @@ def controller_tick(
     if active and config.observe:
         drive_valves(gains, model, measurement, demand, state)
         note_flow(gains, model, measurement, demand, state, inputs.skipped + 1)
-    elif active:
+    elif active and config.law != LAW_VALVE_TEST:
         actuate(gains.actuation, model, measurement, demand, state)
-    else:
+    elif not active:
         stand_still(state, demand)
     state.last_ns = inputs.now_ns
     state.seq += 1

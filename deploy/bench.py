@@ -18,7 +18,7 @@ from zlib import crc32
 from pydantic import Field, ValidationError
 
 from softloop.controller.config import ControllerConfig
-from softloop.deploy.config import RunConfig
+from softloop.deploy.config import CalibrationConfig, RunConfig
 from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig, pressures_process, valves_process
 from softloop.plant.config import PlantConfig, plant_process
 from softloop.watch.config import FoxgloveConfig, LawGains, MonitorConfig, MonitorProcess, PageConfig, RecorderConfig
@@ -56,6 +56,7 @@ class Bench(Table):
     page: PageConfig = PageConfig()
     foxglove: FoxgloveConfig = FoxgloveConfig()
     faults: FaultsConfig = FaultsConfig()
+    calibration: CalibrationConfig | None = None
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def monitor_process(table: MonitorConfig, controller: ControllerConfig) -> Monit
     """What the monitor is given of the controller's table."""
     gains = {"arc": controller.arc, "smc": controller.smc}.get(controller.law)
     law = None if gains is None else LawGains(**{f.name: getattr(gains, f.name) for f in fields(LawGains)})
-    return MonitorProcess(table, controller.parameters, law, controller.law not in ("pressure", "pressure_eso"))
+    return MonitorProcess(table, controller.parameters, law, controller.law not in ("pressure", "pressure_eso", "valve_test"))
 
 
 def _check_together(bench: Bench, source: Source) -> None:

@@ -35,7 +35,7 @@ def pressure(
     ),
     quiet: Quiet = False,
 ) -> int:
-    """Run the pressure law on the [0, 1] and [0, 0.5] Hz multi-sines: Data1 to Data3; exit code 1 where it is off by over 2 kPa."""
+    """Run a pressure law on the two multi-sines, which gives Data1 to Data3; exit code 1 where it is off by more than 2 kPa."""
     from softloop.deploy.bench import find_bench
     from softloop.deploy.experiment import Asked
     from softloop.deploy.experiment_pressure import run_pressure
@@ -61,3 +61,27 @@ def tracking(
 
     chosen = tuple(name.strip() for name in laws.split(",") if name.strip())
     return run_tracking(Asked(find_bench(bench), out, pace, parameters, seed, quiet), chosen, own_gains=own_gains)
+
+
+@experiment_app.command("valves", epilog=EXIT_CODES)
+def valves(
+    bench: BenchArgument,
+    out: Out = None,
+    pace: PaceOption = None,
+    supply: Annotated[str, typer.Option(metavar="KPA,KPA,KPA", help="Supply pressures, gauge; three or more.")] = "150,175,200",
+    ratios: Annotated[
+        bool, typer.Option("--ratios", help="On the actuator itself, without a tank: ratios to its unknown volume.")
+    ] = False,
+    quiet: Quiet = False,
+) -> int:
+    """Flow tests of both valves on the tank of [calibration], as for Fig. 4; exit code 1 where they show nothing of a valve."""
+    from softloop.deploy.bench import find_bench
+    from softloop.deploy.experiment import Asked
+    from softloop.deploy.experiment_valves import run_valves
+    from softloop.wire.errors import BadConfig
+
+    try:
+        supplies = tuple(float(text) for text in supply.split(","))
+    except ValueError:
+        raise BadConfig(f"--supply {supply}: give pressures with commas between, such as 150,175,200") from None
+    return run_valves(Asked(find_bench(bench), out, pace, quiet=quiet), supplies, ratios=ratios)

@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from softloop.controller.records import LAWS, PRESSURE_LAWS
+from softloop.controller.records import ANGLE_LAWS
 from softloop.deploy.experiment import Asked, Place, begin, run_all
 from softloop.offline.evaluation import tuned_file
 from softloop.offline.run_log import open_run
@@ -53,10 +53,8 @@ def run_tracking(asked: Asked, laws: Sequence[str], *, own_gains: bool) -> int:
 
 def check_laws(laws: Sequence[str]) -> None:
     """Raises BadConfig when one does not follow an angle, or there is none."""
-    known = [law for law in LAWS if law not in PRESSURE_LAWS]
-    unknown = [law for law in laws if law not in known]
-    if unknown or not laws:
-        raise BadConfig(f"--laws '{','.join(laws)}': tracking is for {', '.join(known)}")
+    if not laws or not set(laws) <= set(ANGLE_LAWS):
+        raise BadConfig(f"--laws '{','.join(laws)}': tracking is for {', '.join(ANGLE_LAWS)}")
 
 
 def controller_of(law: str, trajectory: str, *, own_gains: bool) -> dict[str, Any]:
