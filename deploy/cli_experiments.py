@@ -85,3 +85,19 @@ def valves(
     except ValueError:
         raise BadConfig(f"--supply {supply}: give pressures with commas between, such as 150,175,200") from None
     return run_valves(Asked(find_bench(bench), out, pace, quiet=quiet), supplies, ratios=ratios)
+
+
+@app.command(epilog=EXIT_CODES)
+def reproduce(
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/reproduce-<UTC time>.")] = None,
+    pace: Annotated[
+        Literal["wall", "lockstep", "batch"], typer.Option(help="Of the experiments; batch is by far the fastest.")
+    ] = "batch",
+    rigs: Annotated[int, typer.Option(metavar="N", min=0, help="Ideal rigs whose intervals are counted; 0: none.")] = 100,
+    seeds: Annotated[str, typer.Option(metavar="A:B", help="Rigs over which fits and laws are judged.")] = "0:20",
+    quiet: Quiet = False,
+) -> int:
+    """Reproduce the paper on simulated rigs: experiments, identification, tracking; one page with the paper's numbers beside ours."""
+    from softloop.deploy.reproduce import Wanted, run_reproduce
+
+    return run_reproduce(Wanted(out, pace, rigs, seeds, quiet))

@@ -167,8 +167,11 @@ def as_dict(found: Found) -> dict[str, Any]:
 
 def _draw(folder: Path, tests: dict[str, FlowTests], fits: dict[str, ValveFit], discharge: float, temperature_k: float) -> None:
     from softloop.offline.identification.flow_figure import figure_4  # noqa: PLC0415 - matplotlib only where it draws
+    from softloop.offline.vector import save  # noqa: PLC0415 - likewise
 
-    figure_4(tests, fits, discharge, temperature_k).savefig(folder / FIGURE)
+    drawn = figure_4(tests, fits, discharge, temperature_k)
+    for ending in ("png", "svg"):
+        save(drawn, (folder / FIGURE).with_suffix(f".{ending}"))
 
 
 def show(place: Place, found: dict[str, Found], *, ratios: bool) -> None:
