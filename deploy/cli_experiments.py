@@ -97,7 +97,7 @@ def reproduce(
     seeds: Annotated[str, typer.Option(metavar="A:B", help="Rigs over which fits and laws are judged.")] = "0:20",
     quiet: Quiet = False,
 ) -> int:
-    """Reproduce the paper on simulated rigs: experiments, identification, tracking; one page with the paper's numbers beside ours."""
+    """Reproduce the paper on simulated rigs: experiments, identification, tracking, and one page with its numbers beside ours."""
     from softloop.deploy.reproduce import Wanted, run_reproduce
 
     return run_reproduce(Wanted(out, pace, rigs, seeds, quiet))

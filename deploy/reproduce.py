@@ -113,7 +113,7 @@ def _folder(wanted: Wanted) -> Path:
 
 
 def experiment(code: int, result: Path) -> None:
-    """An experiment that missed its bar is a number on the page; one that did not come to its end ends all. Raises SoftloopError."""
+    """One that missed its bar is a number on the page; one that did not come to its end ends all. Raises SoftloopError."""
     if code not in (EXIT_OK, EXIT_NEGATIVE) or not result.is_file():
         error = SoftloopError(f"the experiment in {result.parent} ended with exit code {code}; nothing is reproduced from it")
         error.exit_code = code or EXIT_NEGATIVE

@@ -12,6 +12,7 @@ from softloop.controller.config import ControllerConfig
 from softloop.controller.setup import PERIOD_NS, build
 
 MS = 1_000_000
+TRAJECTORIES = {"pressure": "excitation_1hz", "pressure_eso": "excitation_1hz", "valve_test": "valve_steps"}
 
 
 def fed(controller, tick, armed=True, angle=26.75, pressure=0.5, age_ns=3 * MS, status=0, rate=0.0):
@@ -27,10 +28,10 @@ def fed(controller, tick, armed=True, angle=26.75, pressure=0.5, age_ns=3 * MS, 
 
 
 def built(law):
-    return build(ControllerConfig(law=law, trajectory="excitation_1hz" if law == "pressure" else "t1", approach_s=0.05))
+    return build(ControllerConfig(law=law, trajectory=TRAJECTORIES.get(law, "t1"), approach_s=0.05))
 
 
-@pytest.fixture(params=["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure"])
+@pytest.fixture(params=list(r.LAWS))
 def law(request):
     return request.param
 
@@ -88,7 +89,7 @@ def test_rearming_begins_anew_from_what_is_measured(controller, law):
         "adapting",
     ):
         np.testing.assert_array_equal(first[name], expected[name], err_msg=name)
-    if law != "pressure":
+    if law in r.ANGLE_LAWS:
         assert first.reference_deg == 55.0
 
 
