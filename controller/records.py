@@ -126,6 +126,7 @@ OBSERVER_GAINS = record_dtype(
         ("line_s", "f8"),  # the chamber's pressure trails the sensor's block by this
         ("play_ma", "f8"),  # half width of the valves' hysteresis that is compensated
         ("play_still_ma", "f8"),  # a smaller change of the wanted current does not turn the play round
+        ("teach_kpa", "f8"),  # below this chamber pressure the exhaust valve learns no faster than at it
         ("whiteness", "f8"),  # |autocorrelation| of the innovation from which the model is not trusted; 0: always trusted
     ]
 )
