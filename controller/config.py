@@ -91,8 +91,12 @@ class ObserverConfig(Table):
     play_ma: float = Field(8.0, ge=0, le=30, description="half the width of the valves' hysteresis that is undone")
     play_still_ma: float = Field(0.5, ge=0, description="a smaller change of the wanted current does not turn the play round")
     teach_kpa: float = Field(
-        0.0, ge=0, le=100, description="below this pressure, where little flows, the exhaust valve's offset is learned as slowly as at it"
+        0.0,
+        ge=0,
+        le=100,
+        description="below this pressure, where little flows, the exhaust valve's offset is learned as slowly as at it",
     )
+    growth_1_deg: float = Field(0.0, ge=0, le=0.02, description="part by which the chamber's volume grows per degree of bending")
     whiteness: float = Field(0.0, ge=0, le=1, description="trust gate: autocorrelation of the innovation that shuts it; 0: none")
 
 

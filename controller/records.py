@@ -127,6 +127,7 @@ OBSERVER_GAINS = record_dtype(
         ("play_ma", "f8"),  # half width of the valves' hysteresis that is compensated
         ("play_still_ma", "f8"),  # a smaller change of the wanted current does not turn the play round
         ("teach_kpa", "f8"),  # below this chamber pressure the exhaust valve learns no faster than at it
+        ("growth_1_deg", "f8"),  # part by which the chamber's volume grows per degree of bending
         ("whiteness", "f8"),  # |autocorrelation| of the innovation from which the model is not trusted; 0: always trusted
     ]
 )

@@ -31,6 +31,7 @@ class Asked:
         parameters: instead of the bench's own, for the laws.
         seed: of the multi-sines; None: the bench's.
         quiet: no live view and no tables of the runs.
+        report: a report for each run; None: as the bench has it.
     """
 
     bench: Path
@@ -39,6 +40,7 @@ class Asked:
     parameters: str | None = None
     seed: int | None = None
     quiet: bool = False
+    report: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -75,14 +77,14 @@ def run_one(place: Place, name: str, changes: Mapping[str, Any]) -> int:
         changes: tables of the bench file, as they differ from the bench's.
     """
     file = bench_file(place, name, changes)
-    target, quiet = place.run_dir(name), place.asked.quiet
+    target, quiet, report = place.run_dir(name), place.asked.quiet, place.asked.report
     if place.asked.pace == "batch":
         from softloop.deploy.batch_run import run_here  # noqa: PLC0415 - it brings the kernels into this process
 
-        return run_here(file, target, report=place.bench.run.report, quiet=quiet)
+        return run_here(file, target, report=place.bench.run.report if report is None else report, quiet=quiet)
     from softloop.deploy.launcher import Options, launch  # noqa: PLC0415 - likewise Zenoh
 
-    return launch(file, Options(run_dir=target, quiet=quiet, pace=place.asked.pace))
+    return launch(file, Options(run_dir=target, quiet=quiet, pace=place.asked.pace, report=report))
 
 
 def bench_file(place: Place, name: str, changes: Mapping[str, Any]) -> Path:

@@ -14,6 +14,7 @@ from softloop.deploy.experiment import Asked, Place, begin, run_all
 from softloop.offline.evaluation import tuned_file
 from softloop.offline.excitation import BAR_KPA, PressureTracking, pressure_tracking
 from softloop.offline.run_log import open_run
+from softloop.offline.tuning import EXCITATION_APPROACH_S
 from softloop.wire.benchfile import read_toml
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
 
@@ -40,7 +41,7 @@ def controller_of(law: str, trajectory: str) -> dict[str, Any]:
     """The [controller] table of an excitation: the law with its tuned gains where it has some."""
     file = tuned_file(law)
     gains = read_toml(file)["controller"] if file.is_file() else {}
-    return {**gains, "law": law, "trajectory": trajectory}
+    return {**gains, "law": law, "trajectory": trajectory, "approach_s": EXCITATION_APPROACH_S}
 
 
 def check_envelope(place: Place) -> None:

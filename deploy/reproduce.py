@@ -74,7 +74,7 @@ class Work:
     def asked(self, bench: str, name: str, parameters: Path | None = None) -> Asked:
         """An experiment in the folder `name`."""
         chosen = None if parameters is None else str(parameters)
-        return Asked(find_bench(Path(bench)), self.folder / name, self.wanted.pace, chosen, quiet=True)
+        return Asked(find_bench(Path(bench)), self.folder / name, self.wanted.pace, chosen, quiet=True, report=False)
 
     def counting(self, what: str) -> Callable[[int, int], None]:
         return lambda done, total: self.say(what, done, total)

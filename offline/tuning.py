@@ -35,6 +35,7 @@ BARS_DEG = {"t1": 1.0, "steady": 0.3, "t2": 1.0, "peak": 1.5}
 SWITCHES_PER_S = 10.0
 QUIET_PER_S = 5.0  # half the bar: rigs not tuned on switched up to 1.4 times as much (seeds 1008:1028), and a real rig may more
 LOST = 1e4
+EXCITATION_APPROACH_S = 10.0  # long enough that both valves have worked, and are known, before the trajectory begins
 EXCITATIONS = ("excitation_1hz", "excitation_05hz")
 STEP_US = 1000  # of the plant while tuning; evaluation takes the bench file's own
 
@@ -74,6 +75,8 @@ RANGES: dict[str, Ranges] = {
         "observer.pressure_1_s": (15.0, 150.0),
         "observer.play_ma": (3.0, 16.0),
         "observer.play_still_ma": (0.05, 3.0),
+        "observer.teach_kpa": (10.0, 90.0),
+        "observer.growth_1_deg": (5e-4, 5e-3),
     }
     | _DRIVE,
 }
@@ -122,7 +125,8 @@ def start_config(law: str) -> ControllerConfig:
     """What is not tuned, and the same for all: a valve keeps its turn, and the one that waits is nearly open."""
     content: dict[str, Any] = {"law": law, "actuation": {"modes": "latched", "bias_fraction": 0.9}}
     if law == "pressure_eso":  # its observer finds what Delta_2 is, so that no robust term is needed
-        content["pressure"] = {"delta2": 0.0}
+        content |= {"pressure": {"delta2": 0.0}, "approach_s": EXCITATION_APPROACH_S}
+        content["observer"] = {"rate_1_s": 130.0}  # the gyro tells how fast the chamber grows
     return ControllerConfig.model_validate(content)
 
 

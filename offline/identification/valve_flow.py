@@ -112,7 +112,8 @@ def fit_valve(tests: FlowTests, discharge: float = 1.0, temperature_k: float = 2
     if not shown.any():
         return ValveFit(None, values, rank, fit)
     degrees = max(len(best.fun) - rank, 1)
-    length = np.maximum(np.linalg.norm(best.jac, axis=0), 1e-300)
+    length = np.linalg.norm(best.jac, axis=0)
+    length[length == 0.0] = 1.0
     square = (best.jac / length).T @ (best.jac / length)
     inverse = np.linalg.pinv(square, rcond=RANK_TOLERANCE**2, hermitian=True) / np.outer(length, length)
     covariance = inverse * float(best.fun @ best.fun) / degrees * np.outer(SCALE, SCALE)
