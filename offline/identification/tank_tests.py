@@ -32,7 +32,7 @@ from softloop.wire.errors import BadFile
 Floats = NDArray[np.float64]
 VALVES = ("charge", "exhaust")
 LEAST_SAMPLES = 8
-LEAST_KPA = 5.0  # across a valve: below it a sensor's zero is too large a part of it
+LEAST_KPA = 20.0  # across a valve: below it a sensor's zero is too large a part of it
 # Of NAMES, those whose unit has the flow's size in it: an error of the volume is an error of them.
 WITH_VOLUME = np.array([1.0, 0.0, 1.0, 1.0, 0.0])
 
@@ -42,7 +42,7 @@ class Windows:
     """How a test is cut: what is left out after a step of the current, and the length of a window, s."""
 
     settle_s: float = 0.3
-    window_s: float = 0.25
+    window_s: float = 0.5
 
 
 @dataclass(frozen=True)

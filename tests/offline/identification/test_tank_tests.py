@@ -35,13 +35,13 @@ def logs(tmp_path_factory):
     return [tank_log(folder, supply) for supply in SUPPLIES]
 
 
-def tests_of(logs, volume, valve):
+def of_valve(logs, volume, valve):
     return joined([flow_tests(log, volume)[valve] for log in logs])
 
 
 def test_all_five_numbers_of_the_charge_valve_come_back(logs):
     volume = Volume(1e-6 * TANK_ML)
-    found = fit_on_tank(tests_of(logs, volume, "charge"), volume, 0.8)
+    found = fit_on_tank(of_valve(logs, volume, "charge"), volume, 0.8)
     assert (found.rank, found.fit > 99.0) == (5, True)
     assert found.values[0] == pytest.approx(TRUE.k_v1_m2_ma.value, rel=0.03)
     assert found.values[3] == pytest.approx(TRUE.k_v6_m2.value, rel=0.03)
@@ -49,7 +49,7 @@ def test_all_five_numbers_of_the_charge_valve_come_back(logs):
 
 def test_the_exhaust_valves_downstream_never_changes_so_its_ratio_has_no_number(logs):
     volume = Volume(1e-6 * TANK_ML)
-    found = fit_on_tank(tests_of(logs, volume, "exhaust"), volume, 0.8)
+    found = fit_on_tank(of_valve(logs, volume, "exhaust"), volume, 0.8)
     assert found.rank == 4
     assert found.shown == ("k_v1_m2_ma", "k_v2_pa", "k_v3_m2_pa", "k_v6_m2")
     assert found.uncertainty.values[0] == pytest.approx(TRUE.k_v1_m2_ma.value, rel=0.05)
@@ -57,7 +57,7 @@ def test_the_exhaust_valves_downstream_never_changes_so_its_ratio_has_no_number(
 
 def test_an_error_of_the_volume_is_in_the_intervals_that_it_bears_on(logs):
     exact, rough = Volume(1e-6 * TANK_ML), Volume(1e-6 * TANK_ML, error=0.05)
-    tests = tests_of(logs, exact, "charge")
+    tests = of_valve(logs, exact, "charge")
     before, after = fit_on_tank(tests, exact, 0.8).uncertainty, fit_on_tank(tests, rough, 0.8).uncertainty
     assert after.errors[0] == pytest.approx(np.hypot(before.errors[0], 0.05 * before.values[0]))
     assert after.errors[1] == before.errors[1]
@@ -65,7 +65,7 @@ def test_an_error_of_the_volume_is_in_the_intervals_that_it_bears_on(logs):
 
 def test_without_a_volume_ratios_are_given_and_the_volume_is_not(logs):
     nominal = Volume(40e-6)  # far from the truth, and it must not matter
-    found = fit_ratios(tests_of(logs, nominal, "charge"), nominal, 0.8)
+    found = fit_ratios(of_valve(logs, nominal, "charge"), nominal, 0.8)
     assert found.rank == 5
     assert found.names == ("k_v1_m2_ma / V", "k_v2_pa", "k_v3_m2_pa / V", "k_v6_m2 / V", "ratio")
     assert found.sure.values[0] == pytest.approx(TRUE.k_v1_m2_ma.value / (1e-6 * TANK_ML), rel=0.03)
