@@ -133,10 +133,10 @@ def identification(work: Work) -> None:
     sections.add_identification(work.sections, work.numbers, work.folder, found, work.counting("orders"))
 
 
-def _identified(work: Work, name: str, output: str, what: str) -> Identified:
+def _identified(work: Work, name: str, output: str, what: str, only: str = "") -> Identified:
     fast, slow = (work.folder / name / run for run in (FAST, SLOW))
     series = data_of(fast, slow)
-    found = identify_all(series, work.counting(what))
+    found = identify_all(series, work.counting(what), only)
     model = found.model("oe")
     if model.sure is not None:
         write_evidence(work.folder / output, [fast, slow], model.fit, model.sure, list(series))
@@ -168,7 +168,7 @@ def another_rig(work: Work) -> None:
     """A rig that is not the paper's: tracking on Table 1, and on what was identified from its own logs."""
     work.say("another rig", 0, 3)
     experiment(run_pressure(work.asked(OTHER, "other_pressure"), "pressure_eso"), work.folder / "other_pressure" / PRESSURE)
-    _identified(work, "other_pressure", "other_identified.toml", "identifying another rig")
+    _identified(work, "other_pressure", "other_identified.toml", "identifying another rig", only="oe")
     for done, (name, parameters) in enumerate((("other_table1", None), ("other_own", work.folder / "other_identified.toml"))):
         work.say("another rig", done + 1, 3)
         experiment(run_tracking(work.asked(OTHER, name, parameters), MODEL_LAWS, own_gains=False), work.folder / name / TRACKING)

@@ -65,12 +65,13 @@ def data_of(fast: Path, slow: Path) -> tuple[Series, Series, Series]:
     return first, second, third
 
 
-def identify_all(series: tuple[Series, Series, Series], progress: Progress) -> Identified:
-    """Every model, trained on Data1. A method that finds no model is left out with a word."""
+def identify_all(series: tuple[Series, Series, Series], progress: Progress, only: str = "") -> Identified:
+    """Every model (or the one of the key `only`), trained on Data1. A method that finds no model is left out with a word."""
     found: list[Model] = []
     left_out: list[str] = []
-    for done, (key, words, make) in enumerate(_METHODS):
-        progress(done, len(_METHODS))
+    methods = [m for m in _METHODS if only in ("", m[0])]
+    for done, (key, words, make) in enumerate(methods):
+        progress(done, len(methods))
         try:
             fit, sure = make(series[0])
         except (BadConfig, np.linalg.LinAlgError) as error:
@@ -78,7 +79,7 @@ def identify_all(series: tuple[Series, Series, Series], progress: Progress) -> I
             continue
         scores = dict(zip(DATA, (score(fit, s) for s in series), strict=True))
         found.append(Model(key, words, fit, sure, scores))
-    progress(len(_METHODS), len(_METHODS))
+    progress(len(methods), len(methods))
     return Identified(series, tuple(found), tuple(left_out))
 
 
