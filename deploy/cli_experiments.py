@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from softloop.deploy.cli_app import EXIT_CODES, BenchArgument, app
+
+if TYPE_CHECKING:
+    from softloop.plant.config import PlantConfig
 
 experiment_app = typer.Typer(help="Excite a bench's rig for identification, or let its laws track.", rich_markup_mode=None)
 app.add_typer(experiment_app, name="experiment")
@@ -23,6 +26,17 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but err
 Seed = Annotated[int | None, typer.Option(metavar="N", min=0, help="Of the multi-sines' phases; default: the bench's.")]
 
 
+def plant_of(file: Path) -> PlantConfig:
+    """The simulated rig of a bench. Raises BadConfig when it has none."""
+    from softloop.deploy.bench import load_bench
+    from softloop.wire.errors import BadConfig
+
+    plant = load_bench(file).plant
+    if plant is None:
+        raise BadConfig(f"{file}: --over needs a simulated rig, and there is no table [plant]")
+    return plant
+
+
 @experiment_app.command("pressure", epilog=EXIT_CODES)
 def pressure(
     bench: BenchArgument,
@@ -33,13 +47,20 @@ def pressure(
     law: Annotated[Literal["pressure", "pressure_eso"], typer.Option(help="The paper's step 2, or with our observer.")] = (
         "pressure_eso"
     ),
+    over: Annotated[
+        str | None,
+        typer.Option(metavar="A:B", help="Instead on all simulated rigs of these seeds, in one process, without logs."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="With --over: the answer as JSON.")] = False,
     quiet: Quiet = False,
 ) -> int:
     """Run a pressure law on the two multi-sines, which gives Data1 to Data3; exit code 1 where it is off by more than 2 kPa."""
     from softloop.deploy.bench import find_bench
     from softloop.deploy.experiment import Asked
-    from softloop.deploy.experiment_pressure import run_pressure
+    from softloop.deploy.experiment_pressure import run_over_rigs, run_pressure
 
+    if over is not None:
+        return run_over_rigs(law, over, plant_of(find_bench(bench)), as_json=as_json)
     return run_pressure(Asked(find_bench(bench), out, pace, parameters, seed, quiet), law)
 
 

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
+from math import inf
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from softloop.controller.config import ControllerConfig
 from softloop.controller.references import EXCITATION_SPAN_KPA
 from softloop.deploy.experiment import Asked, Place, begin, run_all
+from softloop.deploy.progress import counted_progress
+from softloop.deploy.tune import seeds_of
+from softloop.offline.closed_loop import simulate_run
 from softloop.offline.evaluation import tuned_file
-from softloop.offline.excitation import BAR_KPA, PressureTracking, pressure_tracking
+from softloop.offline.excitation import BAR_KPA, PressureTracking, pressure_tracking, run_tracking
 from softloop.offline.run_log import open_run
 from softloop.offline.tuning import EXCITATION_APPROACH_S
+from softloop.plant.config import PlantConfig
 from softloop.wire.benchfile import read_toml
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
 
@@ -82,3 +90,53 @@ def show(place: Place, found: dict[str, PressureTracking]) -> None:
     console.print(table)
     runs = " ".join(str(place.run_dir(name)) for name in RUNS)
     console.print(f"figure: {place.folder / FIGURE}\nidentify: softloop identify {runs}", soft_wrap=True)
+
+
+def run_over_rigs(law: str, seeds: str, plant: PlantConfig, *, as_json: bool) -> int:
+    """The two runs on every rig of `seeds`, in this process and without logs; EXIT_NEGATIVE where one is off by over BAR_KPA.
+
+    Raises BadConfig.
+    """
+    rigs = seeds_of(seeds)
+    with counted_progress("exciting rigs", quiet=as_json) as progress:
+        found = over_rigs(law, rigs, plant, progress)
+    if as_json:
+        print(json.dumps({"law": law, "seeds": seeds, "runs": found}, indent=2))
+    else:
+        show_rigs(law, seeds, found)
+    return EXIT_OK if all(kept(errors) == len(rigs) for errors in found.values()) else EXIT_NEGATIVE
+
+
+def over_rigs(law: str, seeds: Sequence[int], plant: PlantConfig, progress: Callable[[int, int], None]) -> dict[str, list[float]]:
+    """Name of the run -> largest error on each rig, kPa; inf where the gate broke it off."""
+    found: dict[str, list[float]] = {name: [] for name in RUNS}
+    for done, seed in enumerate(seeds):
+        progress(done, len(seeds))
+        for name, errors in found.items():
+            controller = ControllerConfig.model_validate(controller_of(law, name))
+            run = simulate_run(controller, plant.model_copy(update={"seed": seed}))
+            errors.append(run_tracking(run, controller.actuation_delay_ms).max_kpa if run.completed else inf)
+    progress(len(seeds), len(seeds))
+    return found
+
+
+def kept(errors: Sequence[float]) -> int:
+    """On how many rigs the bar was kept."""
+    return sum(error <= BAR_KPA for error in errors)
+
+
+def show_rigs(law: str, seeds: str, found: dict[str, list[float]]) -> None:
+    """Median and worst of each run."""
+    table = Table(title=f"{law}, rigs {seeds}: largest error of a run, as measured, kPa", title_justify="left")
+    for heading in ("run", "median", "worst", "of rig", f"within {BAR_KPA:g} kPa"):
+        table.add_column(heading, justify="left" if heading == "run" else "right")
+    for name, errors in found.items():
+        worst = int(np.argmax(errors))
+        cells = (
+            f"{np.median(errors):.2f}",
+            f"{errors[worst]:.2f}",
+            str(seeds_of(seeds)[worst]),
+            f"{kept(errors)} of {len(errors)}",
+        )
+        table.add_row(RUNS[name], *cells)
+    Console(highlight=False).print(table)
