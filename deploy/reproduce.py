@@ -33,13 +33,13 @@ from softloop.deploy.experiment_valves import SUPPLIES_KPA, run_name, run_valves
 from softloop.deploy.tune import seeds_of
 from softloop.offline.evaluation import LAWS, OWN, evaluate, figures
 from softloop.offline.identification.experiments import FAST
+from softloop.offline.identification.intervals import of_fit
 from softloop.offline.reproduction import SLOW, Identified, data_of, fit_over_rigs, identify_all
 from softloop.offline.reproduction_page import Section, page_of
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig, SoftloopError, Unavailable
 
 PAGE, NUMBERS, COVERAGE = "reproduce.html", "reproduce.json", "coverage.json"
 TRACKED = ("pid", "smc", "arc", "arc_eso")
-MODEL_LAWS = ("smc", "arc")  # whose tracking rests on the bending parameters
 RIG, TANK, OTHER = "sim", "sim_tank", "sim_firm"
 
 
@@ -137,9 +137,9 @@ def _identified(work: Work, name: str, output: str, what: str, only: str = "") -
     fast, slow = (work.folder / name / run for run in (FAST, SLOW))
     series = data_of(fast, slow)
     found = identify_all(series, work.counting(what), only)
-    model = found.model("oe")
-    if model.sure is not None:
-        write_evidence(work.folder / output, [fast, slow], model.fit, model.sure, list(series))
+    fit = found.model("oe").fit
+    # For the laws the bounds are the paper's: three standard errors of white residuals.
+    write_evidence(work.folder / output, [fast, slow], fit, of_fit(fit, [series[0]], "white"), list(series))
     return found
 
 
@@ -171,7 +171,7 @@ def another_rig(work: Work) -> None:
     _identified(work, "other_pressure", "other_identified.toml", "identifying another rig", only="oe")
     for done, (name, parameters) in enumerate((("other_table1", None), ("other_own", work.folder / "other_identified.toml"))):
         work.say("another rig", done + 1, 3)
-        experiment(run_tracking(work.asked(OTHER, name, parameters), MODEL_LAWS, own_gains=False), work.folder / name / TRACKING)
+        experiment(run_tracking(work.asked(OTHER, name, parameters), TRACKED, own_gains=False), work.folder / name / TRACKING)
     sections.add_other(work.sections, work.numbers, work.folder)
 
 
