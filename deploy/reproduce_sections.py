@@ -204,8 +204,10 @@ def add_other(sections: Sections, numbers: Numbers, folder: Path) -> None:
         "The actuator is 12 % stiffer than Table 1, with 10 % less torque from pressure and 15 % more damping (parameters firm)."
     )
     section = Section("Another rig: on Table 1, and on parameters identified from its own logs", lead)
-    note = "smc and arc size their robust terms by the parameters' bounds (Eqs. 38 and 47). Here these are three standard errors of one "
-    note += "experiment, and in c2 and c3 far wider than Table 1's: smc, which learns nothing, then asks for more than the valves can do."
+    note = (
+        "smc and arc size their robust terms by the parameters' bounds (Eqs. 38 and 47). Here these are three standard errors of "
+        "one experiment, in c2 and c3 far wider than Table 1's: smc, which learns nothing, then asks for more than valves can do."
+    )
     section.parts.append(TableOf("Error, true angle less reference, deg", heads, tuple(rows), note))
     sections.append(section)
 
