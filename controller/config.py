@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from softloop.wire.benchfile import Table
+from softloop.wire.benchfile import ProcessTable, Table
 
 
 class ActuationConfig(Table):
@@ -122,7 +122,7 @@ class ValveTestConfig(Table):
     low_kpa: float = Field(2.0, gt=0, description="the exhaust valve at this one")
 
 
-class ControllerConfig(Table):
+class ControllerConfig(ProcessTable):
     """`[controller]`: the law, its trajectory, and what it is told of delays and budgets."""
 
     law: Literal["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure", "pressure_eso", "valve_test"] = Field(

@@ -18,12 +18,14 @@ from zlib import crc32
 from pydantic import Field, ValidationError
 
 from softloop.controller.config import ControllerConfig
-from softloop.deploy.config import CalibrationConfig, RunConfig
+from softloop.deploy.config import CalibrationConfig, MachineConfig, RunConfig
+from softloop.deploy.hosts import check_hosts
 from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig, pressures_process, valves_process
 from softloop.plant.config import PlantConfig, plant_process
 from softloop.watch.config import FoxgloveConfig, LawGains, MonitorConfig, MonitorProcess, PageConfig, RecorderConfig
 from softloop.wire.benchfile import Table, load_model, read_toml, validated
 from softloop.wire.can_config import CanConfig
+from softloop.wire.clock_config import ClockConfig
 from softloop.wire.config import HostConfig, PaceConfig, ZenohConfig
 from softloop.wire.errors import BadConfig, BadFile
 from softloop.wire.fault_config import FaultsConfig
@@ -43,6 +45,8 @@ class Bench(Table):
     name: str = Field(pattern=NAME, description="part of every Zenoh key: a-z, 0-9, _ and -, at most 24")
     zenoh: ZenohConfig = ZenohConfig()
     host: HostConfig = HostConfig()
+    hosts: dict[str, MachineConfig] = Field(default_factory=dict)
+    clock: ClockConfig = ClockConfig()
     pace: PaceConfig = PaceConfig()
     run: RunConfig = RunConfig()
     can: dict[str, CanConfig] = Field(default_factory=dict)
@@ -102,6 +106,11 @@ def read_source(path: Path, run_dir: Path | None = None) -> Source:
         own.pop("base", None)
         _merge(content, origins, _substituted(own, file, run_dir), file, ())
     return Source(path, content, origins, run_dir)
+
+
+def folders_of(path: Path) -> tuple[str, ...]:
+    """What `{bench_dir}` becomes in a bench file and its bases."""
+    return tuple(str(file.parent.resolve()) for file, _ in _chain(path))
 
 
 def load_bench(path: Path, run_dir: Path | None = None) -> Bench:
@@ -169,6 +178,10 @@ def _check_together(bench: Bench, source: Source) -> None:
             raise BadConfig(f"{source.origin(where)}: {error}") from None
     if bench.pace.mode == "lockstep":
         _check_lockstep(bench, source)
+    try:
+        check_hosts(bench)
+    except BadConfig as error:
+        raise BadConfig(f"{source.file}: {error}") from None
 
 
 def _check_lockstep(bench: Bench, source: Source) -> None:

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,10 +97,13 @@ class Children:
         """A child that is no longer running, if there is one, other than those named in `but`."""
         return next((c for c in self.all.values() if c.name not in but and c.exit_code() is not None), None)
 
-    def stop(self, order: Iterable[Sequence[str]], timeout_s: float) -> list[Child]:
+    def stop(
+        self, order: Iterable[Sequence[str]], timeout_s: float, after_group: Callable[[Sequence[str]], None] = lambda group: None
+    ) -> list[Child]:
         """Ask each group in turn to end, and kill what has not after `timeout_s`; returns the killed ones."""
         for group in order:
             self._stop_group([self.all[name] for name in group if name in self.all], timeout_s)
+            after_group(group)
         rest = [c for c in self.all.values() if c.exit_code() is None]
         self._stop_group(rest, timeout_s)
         return [c for c in self.all.values() if c.killed]

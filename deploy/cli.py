@@ -17,6 +17,7 @@ from softloop.wire.errors import EXIT_LOST, EXIT_OK, EXIT_USAGE, BadConfig, Soft
 def run(
     bench: BenchArgument,
     run_dir: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/<bench>-<UTC time>.")] = None,
+    host: Annotated[str | None, typer.Option(metavar="NAME", help="Of a bench on several hosts: which of them this is.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="End after S seconds, armed.")] = None,
     no_report: Annotated[bool, typer.Option("--no-report", help="Leave out the report at the end.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False,
@@ -30,13 +31,19 @@ def run(
         Path | None,
         typer.Option(metavar="SCENARIO.toml", help="Let things go wrong, and judge how that ends; see `softloop faults`."),
     ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="What `softloop doctor --certificate` wrote: into the log.")
+    ] = None,
 ) -> int:
     """Run a bench: start its processes, arm, watch, vent, stop, summary and report."""
     from softloop.deploy.bench import find_bench
     from softloop.deploy.launcher import Options, launch
 
     report = False if no_report else None
-    options = Options(run_dir=run_dir, duration_s=duration, report=report, quiet=quiet, pace=pace, page=page, foxglove=foxglove)
+    options = Options(
+        run_dir=run_dir, duration_s=duration, report=report, quiet=quiet, pace=pace, page=page, foxglove=foxglove,
+        certificate=certificate, host=host,
+    )  # fmt: skip
     if faults is not None:
         from softloop.deploy.faults import run_with_faults
 
@@ -62,6 +69,7 @@ def node(
 def check(bench: BenchArgument) -> int:
     """Check a bench file, and that the actuator can follow its trajectory."""
     from softloop.deploy.bench import find_bench, load_bench
+    from softloop.deploy.hosts import shares
     from softloop.deploy.node import processes_of
     from softloop.deploy.prepare import check_controller, check_identity
 
@@ -69,7 +77,8 @@ def check(bench: BenchArgument) -> int:
     trajectory_s = check_controller(loaded)
     check_identity(loaded)
     names = ", ".join(p.name for p in processes_of(loaded)) or "no process"
-    print(f"{bench}: good. Bench '{loaded.name}': {names}; trajectory {trajectory_s:.1f} s")
+    where = "".join(f"; host {host}: {', '.join(processes)}" for host, processes in shares(loaded).items())
+    print(f"{bench}: good. Bench '{loaded.name}': {names}; trajectory {trajectory_s:.1f} s{where}")
     return EXIT_OK
 
 
@@ -272,15 +281,38 @@ def warm(quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing
 
 
 @app.command()
-def router(bench: BenchArgument) -> int:
+def router(
+    bench: BenchArgument,
+    program: Annotated[
+        Literal["auto", "zenohd", "softloop"],
+        typer.Option("--with", help="auto: zenohd where it is installed, else softloop itself."),
+    ] = "auto",
+) -> int:
     """Be the meeting point of a bench until Ctrl-C, for benches with `[run] shared_router = true`."""
     from softloop.deploy.bench import find_bench, load_bench
     from softloop.deploy.launcher import stop_on_signals
     from softloop.deploy.router import run_router
+    from softloop.deploy.zenohd import find_zenohd
 
     with stop_on_signals() as stop:
-        run_router(load_bench(find_bench(bench)), stop)
+        run_router(load_bench(find_bench(bench)), stop, find_zenohd(program))
     return EXIT_OK
+
+
+@app.command()
+def keys(
+    bench: BenchArgument,
+    renew: Annotated[bool, typer.Option("--renew", help="Make anew what is there.")] = False,
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="This one alone; several by giving it again.")] = None,
+    authority: Annotated[bool, typer.Option("--authority", help="With --renew: the authority too; older keys are void.")] = False,
+    days: Annotated[int | None, typer.Option(metavar="N", min=1, max=3650, help="Instead of [zenoh.tls] valid_days.")] = None,
+) -> int:
+    """Make the certificate authority and the identities of a bench with [zenoh.tls]; what is there stays, unless --renew."""
+    from softloop.deploy.keys import make_keys
+
+    if authority and (not renew or only):
+        raise BadConfig("keys: --authority goes with --renew, and makes everybody's keys anew")
+    return make_keys(bench, renew=renew, only=only or (), authority=authority, days=days)
 
 
 @app.command(hidden=True)
@@ -295,7 +327,8 @@ def prepare(bench: BenchArgument, run_dir: RunDir) -> int:
 
 # After these in the list of commands; each enters itself.
 import softloop.deploy.cli_campaigns  # noqa: E402
-import softloop.deploy.cli_experiments  # noqa: E402, F401
+import softloop.deploy.cli_experiments  # noqa: E402
+import softloop.deploy.cli_machine  # noqa: E402, F401
 
 
 def main(arguments: list[str] | None = None) -> None:

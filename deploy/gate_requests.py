@@ -9,7 +9,7 @@ from typing import Literal
 
 from softloop.deploy.bench import Bench
 from softloop.deploy.rig_state import GATE_ARMED, GATE_DISARMED, GATE_FAULT, GATES, RigState
-from softloop.wire.channels import REQUEST
+from softloop.wire.channels import ARM, REQUEST
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, Unavailable
 from softloop.wire.messages import constant, message
 from softloop.wire.session import Wire, open_wire
@@ -23,21 +23,29 @@ FIND_GATE_S = 3.0  # a gate speaks every 5 ms; joining takes well under a second
 
 
 class Requests:
-    """One requester: its random name on the wire, and its count."""
+    """One requester: its random name on the wire, and its count on each of the two channels."""
 
     def __init__(self, wire: Wire, origin: int = 0) -> None:
         """`origin`: a number of its own, not 0; random unless given."""
-        self._put = wire.publisher(REQUEST)
+        self._wire = wire
+        self._puts = {channel.name: wire.publisher(channel) for channel in (REQUEST, ARM) if wire.may_put(channel)}
         self._origin = origin or secrets.randbits(63)
-        self._seq = 0
+        self._seqs = {REQUEST.name: 0, ARM.name: 0}
 
     def send(self, action: Action, stamp_ns: int | None = None) -> None:
-        """Publish one request, stamped now unless `stamp_ns` says when it is to hold (lockstep pace)."""
-        self._seq += 1
+        """Publish one request, stamped now unless `stamp_ns` says when it is to hold (lockstep pace).
+
+        Raises Unavailable when this requester has no right to it.
+        """
+        channel = ARM if action == "arm" else REQUEST
+        if channel.name not in self._puts:
+            raise self._wire.refused("publish on", channel)
+        self._seqs[channel.name] += 1
         request = message("GateRequest")
         code = constant("GateRequest", f"ACTION_{action.upper()}")
         stamp_ns = time.monotonic_ns() if stamp_ns is None else stamp_ns
-        self._put(request.pack(request.make(seq=self._seq, stamp_ns=stamp_ns, origin=self._origin, action=code)))
+        made = request.make(seq=self._seqs[channel.name], stamp_ns=stamp_ns, origin=self._origin, action=code)
+        self._puts[channel.name](request.pack(made))
 
 
 def ask(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import resource
 import signal
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from softloop.deploy.bench import Bench
 from softloop.deploy.children import Child, Children
 from softloop.deploy.launcher_events import LauncherEvents
 from softloop.deploy.rig_state import RigState
+from softloop.wire.clock import Clock, WallClock
 from softloop.wire.fault_config import LAUNCHER, InjectionConfig
 from softloop.wire.faults import NUMBERS
 
@@ -22,13 +22,20 @@ class Injector:
     """Carries out the launcher's injections when the launcher looks, so up to a tenth of a second late; events say when."""
 
     def __init__(
-        self, bench: Bench, run_dir: Path, events: LauncherEvents, children: Children, start: Callable[[str], None]
+        self,
+        bench: Bench,
+        run_dir: Path,
+        events: LauncherEvents,
+        children: Children,
+        start: Callable[[str], None],
+        clock: Clock | None = None,
     ) -> None:
         self._waiting = [injection for _, injection in bench.faults.of_process(LAUNCHER)]
         self._standing: list[InjectionConfig] = []
         self._children, self._start = children, start
         self._log = run_dir / bench.recorder.file if bench.recorder is not None else run_dir
         self._events = events
+        self._clock = clock or WallClock()
         self._armed_ns: int | None = None
 
     def act(self, state: RigState) -> None:
@@ -39,7 +46,7 @@ class Injector:
             self._armed_ns = int(state.valves.stamp_ns)
         if self._armed_ns is None:
             return
-        since_s = (time.monotonic_ns() - self._armed_ns) / _S
+        since_s = (self._clock.now_ns() - self._armed_ns) / _S
         for injection in [i for i in self._waiting if i.at_s <= since_s]:
             self._waiting.remove(injection)
             if self._alive(injection) is None:

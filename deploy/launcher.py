@@ -2,42 +2,44 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Literal, Self
 
-from softloop.deploy.bench import Bench, load_bench
+from softloop.deploy.bench import Bench, folders_of, load_bench
 from softloop.deploy.beside import beside
 from softloop.deploy.children import Child, Children
 from softloop.deploy.conclude import conclude
+from softloop.deploy.fleet import READY, RUNNING, STOPPING, Alone, Fleet
 from softloop.deploy.gate_requests import Requests, ask
+from softloop.deploy.hosts import choose_host, digest, share_of
 from softloop.deploy.injector import Injector
 from softloop.deploy.keeper import Keeper, Kept
 from softloop.deploy.launcher_events import LauncherEvents
 from softloop.deploy.live import View, make_view
+from softloop.deploy.meeting import Meeting
 from softloop.deploy.node import KEPT_PROCESSES, STOP_ORDER, processes_of
 from softloop.deploy.prepare import prepare_in_child
 from softloop.deploy.progress import compile_progress
 from softloop.deploy.rig_state import GATE_FAULT, RigState
+from softloop.deploy.rotate import in_use, keeping_budget, make_room
 from softloop.deploy.router import launcher_wire, remove_sockets
-from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench, make_run_dir
-from softloop.wire.channels import HELLO
+from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench, keep_certificate, make_run_dir
 from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, BadConfig
-from softloop.wire.lockstep import Lockstep
-from softloop.wire.schedule import LAUNCHER_ORIGIN, Schedule, make_schedule
 from softloop.wire.session import Wire
 from softloop.wire.shell import Stop
 
 POLL_S = 0.1
+_DIGITS = re.compile(r"[0-9.]+")
 # The gate speaks 200 times a second; a second of silence, far above any pause of a healthy machine, is a hung process.
 GATE_SILENT_NS = 1_000_000_000
-AFTER_S = 0.1  # lockstep pace: from the end of the trajectory to disarming
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,8 @@ class Options:
     pace: Literal["wall", "lockstep"] | None = None
     page: bool = False
     foxglove: bool = False
+    certificate: Path | None = None
+    host: str | None = None
 
 
 def _conclude(bench: Bench, run_dir: Path, outcome: Outcome, *, quiet: bool) -> int:
@@ -71,26 +75,44 @@ def launch(bench_file: Path, options: Options, then: Callable[..., int] = _concl
 
     Raises:
         BadFile, BadConfig: the bench file is wrong, or its trajectory not feasible.
-        Unavailable: the bench runs already, its address is in use, or the run directory cannot be made.
+        Unavailable: the bench runs already, its address is in use, its disk budget is used up, or the run directory cannot
+            be made.
     """
     bench = _with_options(load_bench(bench_file), options)
+    host, same = choose_host(bench, options.host), digest(bench, folders_of(bench_file))
     if not processes_of(bench):
         raise BadConfig(f"{bench_file}: no process to run: it has none of the tables plant, valves, controller, ...")
-    with stop_on_signals() as stop, bench_lock(bench.name):
-        run_dir = make_run_dir(bench, options.run_dir)
+    with stop_on_signals() as stop, bench_lock(f"{bench.name}@{host}" if host else bench.name), ExitStack() as held:
+        make_room(bench)
+        run_dir = make_run_dir(bench, options.run_dir, host)
         bench = _with_options(load_bench(bench_file, run_dir), options)
         keep_bench(run_dir, bench)
+        held.enter_context(in_use(run_dir))
+        keep_certificate(run_dir, bench)
         with compile_progress(quiet=options.quiet) as progress:
             prepared = prepare_in_child(run_dir / BENCH_FILE, run_dir, stop, progress)
         with (
-            launcher_wire(bench) as wire,
             closing(make_view(prepared.trajectory_s, quiet=options.quiet)) as view,
+            keeping_budget(bench, view.say),
+            launcher_wire(bench, host, stop, view.say) as wire,
+            closing(_fleet(bench, host, wire, same)) as fleet,
             beside(onlookers(run_dir, options), run_dir, view.say) as viewers,
         ):
-            kind = Launch if bench.pace.mode == "wall" else LockstepLaunch
-            launch = kind(bench, run_dir, wire, view, stop, Children(), prepared.trajectory_s)
+            launch = launch_class(bench, fleet)(bench, run_dir, wire, view, stop, Children(), prepared.trajectory_s, fleet)
             outcome = launch.looking_after(viewers).run()
-        return then(bench, run_dir, outcome, quiet=options.quiet)
+        return then(share_of(bench, host), run_dir, outcome, quiet=options.quiet)
+
+
+def _fleet(bench: Bench, host: str, wire: Wire, same: int) -> Alone:
+    return Fleet(bench, host, wire, same, LauncherEvents(wire).clock) if host else Alone()
+
+
+def launch_class(bench: Bench, fleet: Alone) -> type[Launch]:
+    """How a bench is run here: by its pace, and by whether this host leads."""
+    from softloop.deploy.host_launch import FollowLaunch  # noqa: PLC0415 - they are made of what stands here
+    from softloop.deploy.lockstep_launch import LockstepLaunch  # noqa: PLC0415
+
+    return FollowLaunch if not fleet.leads else Launch if bench.pace.mode == "wall" else LockstepLaunch
 
 
 def onlookers(run_dir: Path, options: Options) -> list[list[str]]:
@@ -101,11 +123,13 @@ def onlookers(run_dir: Path, options: Options) -> list[list[str]]:
 
 def _with_options(bench: Bench, options: Options) -> Bench:
     """The bench with what the command line changes."""
-    changed: dict[str, float | bool] = {}
+    changed: dict[str, float | bool | str] = {}
     if options.duration_s is not None:
         changed["duration_s"] = options.duration_s
     if options.report is not None:
         changed["report"] = options.report
+    if options.certificate is not None:
+        changed["certificate"] = str(options.certificate)
     paced = bench.pace if options.pace is None else bench.pace.model_copy(update={"mode": options.pace})
     return bench.model_copy(update={"run": bench.run.model_copy(update=changed), "pace": paced})
 
@@ -131,9 +155,18 @@ class Launch:
     """One run of a bench, from the first process started to the last one gone."""
 
     def __init__(
-        self, bench: Bench, run_dir: Path, wire: Wire, view: View, stop: Stop, children: Children, trajectory_s: float = 0.0
+        self,
+        bench: Bench,
+        run_dir: Path,
+        wire: Wire,
+        view: View,
+        stop: Stop,
+        children: Children,
+        trajectory_s: float = 0.0,
+        fleet: Alone | None = None,
     ) -> None:
         self.bench = bench
+        self.fleet = fleet or Alone()
         self.trajectory_s = trajectory_s
         self.run_dir = run_dir
         self.wire = wire
@@ -142,11 +175,15 @@ class Launch:
         self.state = RigState(wire)
         self.requests = Requests(wire)
         self.children = children
-        events = LauncherEvents(wire)
+        self.lost_name = ""
+        self.code = EXIT_LOST
+        events = LauncherEvents(wire, self.fleet.clock, None if self.fleet.leads else self.fleet.number)
+        watched = bench.run.shared_router or not self.fleet.leads
+        self.meeting = Meeting(wire, watched=watched, say=view.say, tell=events.router)
         self.keeper = Keeper(view.say, events.process)
         self.words: dict[str, str] = {}
         self.all_alive = False
-        self.injector = Injector(bench, run_dir, events, children, self._start_killed)
+        self.injector = Injector(bench, run_dir, events, children, self._start_killed, self.fleet.clock)
 
     def looking_after(self, viewers: Iterable[Kept]) -> Self:
         """Bring back the viewers too when they die."""
@@ -159,6 +196,7 @@ class Launch:
         try:
             outcome = self._until_over()
             self._show("stopping")
+            self.code = outcome.code
             return replace(self._vented(outcome), began=self.state.was_armed or outcome.code == EXIT_OK)
         finally:
             self._stop_children()
@@ -172,7 +210,8 @@ class Launch:
 
     def _start(self) -> None:
         for process in processes_of(self.bench):
-            self._start_one(process.name)
+            if self.fleet.has(process.name):
+                self._start_one(process.name)
 
     def _start_one(self, name: str) -> Child:
         """Start a process of the bench, or start it anew."""
@@ -204,7 +243,29 @@ class Launch:
             return Outcome(EXIT_LOST, f"not alive after {limit:g} s: {self._last_words(missing)}; see the logs in {self.run_dir}")
         self.all_alive = True
         self._keep_listeners()
-        return None
+        self.fleet.say(READY)
+        return self._wait_for_hosts()
+
+    def _wait_for_hosts(self) -> Outcome | None:
+        """Until nothing is missing on the bench's other hosts; says what is."""
+        run = self.bench.run
+        limit_s = run.hosts_wait_s + (0.0 if self.fleet.leads else run.host_silence_s)  # the host that leads is to say it first
+        end_s, said = time.monotonic() + limit_s, ""
+        while True:
+            missing = ", ".join(self.fleet.missing())
+            if not missing:
+                self.fleet.say(RUNNING)
+                return None
+            if _DIGITS.sub("", missing) != said:  # another figure alone is no news
+                said = _DIGITS.sub("", missing)
+                self.view.say(f"waiting for {missing}")
+            self._refresh("waiting")
+            trouble = self._trouble()
+            if trouble is not None:
+                return trouble
+            if time.monotonic() >= end_s:
+                return Outcome(EXIT_LOST, f"not there after {limit_s:g} s: {missing}")
+            self.stop.wait(POLL_S)
 
     def _keep_listeners(self) -> None:
         """From now on those that only listen are brought back when they die. At lockstep pace none is: all wait for all."""
@@ -228,9 +289,13 @@ class Launch:
         armed = ask(self.requests, self.state, "arm", limit, give_up=lambda: self._trouble() is not None, on_event=self.view.say)
         if armed:
             return None
-        said = self.children.all["valves"].last_line()
-        refused = Outcome(EXIT_NEGATIVE, f"the gate was not armed within {limit:g} s: {said or self.state.reason}")
+        refused = Outcome(EXIT_NEGATIVE, f"the gate was not armed within {limit:g} s: {self._words_of_gate()}")
         return self._trouble() or refused
+
+    def _words_of_gate(self) -> str:
+        """What the gate said last, here or on the wire."""
+        child = self.children.all.get("valves")
+        return (child.last_line() if child is not None else "") or self.state.reason
 
     def _watch(self) -> Outcome:
         """Until the controller is done, the time is over, or something went wrong."""
@@ -254,13 +319,33 @@ class Launch:
         ended = self.children.ended(but=self.keeper.names)
         if ended is not None:
             return self._lost(ended)
-        if self.state.gate == GATE_FAULT:
+        elsewhere = self._without_router() or self._of_fleet()
+        if elsewhere is not None:
+            return elsewhere
+        if self.state.gate == GATE_FAULT and not self.meeting.excuses and not self.meeting.awaits_arming:
             return Outcome(EXIT_NEGATIVE, f"the gate went to FAULT: {self.state.reason}")
+        if self.meeting.excuses:
+            return None
         if self.state.valves is not None and time.monotonic_ns() - self.state.valves_heard_ns > GATE_SILENT_NS:
             return Outcome(EXIT_LOST, "process 'valves' is silent: nothing heard from the gate for a second")
         return None
 
+    def _without_router(self) -> Outcome | None:
+        run = self.bench.run
+        limit_s = run.router_wait_s if run.shared_router else run.host_silence_s
+        if self.meeting.away_s <= limit_s:
+            return None
+        return Outcome(
+            EXIT_LOST, f"the meeting point {self.bench.zenoh.meeting_point(self.bench.name)} is gone for {limit_s:g} s"
+        )
+
+    def _of_fleet(self) -> Outcome | None:
+        """Why the run cannot go on, as far as other hosts are concerned."""
+        ending = self.fleet.trouble(excused=self.meeting.excuses)
+        return None if ending is None else Outcome(*ending)
+
     def _lost(self, child: Child) -> Outcome:
+        self.lost_name = child.name
         self.words[child.name] = "ended"
         return Outcome(EXIT_LOST if self.all_alive else child.exit_code_for_a_person(), child.epitaph())
 
@@ -283,9 +368,12 @@ class Launch:
         return not self.state.armed and self.state.vented(self.bench.run.vented_kpa)
 
     def _stop_children(self) -> None:
+        limit_s = self.bench.run.stop_timeout_s
         try:
-            for child in self.children.stop(STOP_ORDER, self.bench.run.stop_timeout_s):
+            self.fleet.say(STOPPING, self.code)
+            for child in self.children.stop(STOP_ORDER, limit_s, lambda group: self.fleet.await_gone(group, limit_s)):
                 self.view.say(f"process '{child.name}' did not end in {self.bench.run.stop_timeout_s:g} s and was killed")
+            self.fleet.linger(2 * limit_s)
         finally:
             self.children.close()
             for child in self.children.all.values():
@@ -294,69 +382,11 @@ class Launch:
     def _refresh(self, stage: str) -> None:
         for line in self.state.refresh():
             self.view.say(line)
+        self.meeting.look(self.state.reason if self.state.gate == GATE_FAULT else None)
+        self.fleet.look()
         self.injector.act(self.state)
         self.keeper.look(time.monotonic())
         self._show(stage)
 
     def _show(self, stage: str) -> None:
         self.view.show(stage, self.state, self.words)
-
-
-class LockstepLaunch(Launch):
-    """A run at lockstep pace: planned beforehand, tick by tick, and over when the plant has taken the last one."""
-
-    def _keep_listeners(self) -> None:
-        pass
-
-    def _until_over(self) -> Outcome:
-        self._start()
-        return self._wait_alive() or self._conduct() or self._watch_ticks()
-
-    def _conduct(self) -> Outcome | None:
-        """Hand the gate its requests beforehand, and give the word to begin."""
-        schedule = schedule_of(self.bench, self.trajectory_s)
-        pace = Lockstep(self.bench.pace, self.wire, self.stop, set(self.words))
-        pace.meet(pace.others, None)
-        requests = Requests(self.wire, LAUNCHER_ORIGIN)
-        if self.bench.run.arm:
-            requests.send("arm", schedule.arm_ns)
-            requests.send("disarm", schedule.disarm_ns)
-            pace.board.wait(
-                lambda: pace.board.present["valves"].requests >= 2, lambda: "'valves', which has two requests to take"
-            )
-        pace.board.wait(lambda: pace.board.tick is not None, lambda: "'plant'", lambda: pace.say(HELLO, ticks=schedule.ticks))
-        return self._trouble()
-
-    def _watch_ticks(self) -> Outcome:
-        while True:
-            self._refresh("running")
-            trouble = self._trouble()
-            if trouble is not None:
-                return trouble
-            if all(child.exit_code() == EXIT_OK for name, child in self.children.all.items() if name != "recorder"):
-                return self._over()
-            self.stop.wait(POLL_S)
-
-    def _over(self) -> Outcome:
-        self._refresh("running")
-        if self.state.gate == GATE_FAULT:
-            return Outcome(EXIT_NEGATIVE, f"the gate went to FAULT: {self.state.reason}")
-        if self.bench.run.arm and not self.state.was_armed:
-            return Outcome(EXIT_NEGATIVE, f"the gate was not armed: {self.children.all['valves'].last_line()}")
-        return Outcome(EXIT_OK, "the run is over, tick by tick")
-
-    def _trouble(self) -> Outcome | None:
-        if self.stop:
-            return Outcome(EXIT_INTERRUPTED, f"interrupted ({self.stop.reason})")
-        lost = next((c for c in self.children.all.values() if c.exit_code() not in (None, EXIT_OK)), None)
-        return None if lost is None else self._lost(lost)
-
-    def _vented(self, outcome: Outcome) -> Outcome:
-        return outcome  # venting is part of the plan
-
-
-def schedule_of(bench: Bench, trajectory_s: float) -> Schedule:
-    """The plan of a run: settle, arm, follow the trajectory (or `[run] duration_s`), disarm, vent."""
-    approach_s = bench.controller.approach_s if bench.controller is not None else 0.0
-    armed_s = bench.run.duration_s or approach_s + trajectory_s + AFTER_S
-    return make_schedule(bench.run.settle_s, armed_s, bench.run.vent_timeout_s)

@@ -7,7 +7,10 @@ from importlib import import_module
 from pathlib import Path
 
 from softloop.deploy.bench import PROCESS_NAMES, Bench, load_bench, process_config
+from softloop.deploy.hosts import host_of, leader, number_of, on_host
+from softloop.wire.clock import Clock
 from softloop.wire.errors import BadConfig
+from softloop.wire.host_clock import HostClock
 from softloop.wire.messages import constant
 from softloop.wire.pace import Pace
 from softloop.wire.schedule import make_schedule
@@ -71,6 +74,7 @@ def run_node(name: str, bench_file: Path, run_dir: Path, lifeline_fd: int | None
     """
     bench = load_bench(bench_file, run_dir)
     process = find_process(bench, name)
+    bench = on_host(bench, host_of(bench, name))
 
     def body(context: Context) -> None:
         _inject(bench, process, context)
@@ -104,10 +108,20 @@ def planned_arming_ns(bench: Bench) -> int:
     return make_schedule(bench.run.settle_s, 0.0, 0.0).arm_ns
 
 
+def rig_clock(bench: Bench, host: str, wire: Wire, stop: Stop) -> Clock | None:
+    """The clock at wall pace: None for the machine's own, else one that follows this host's launcher, once that has spoken."""
+    if not host or host == leader(bench):
+        return None
+    clock = HostClock(number_of(bench, host))
+    clock.listen(wire)
+    clock.wait_known(lambda: bool(stop))
+    return clock
+
+
 def make_pace(bench: Bench, name: str, wire: Wire, stop: Stop) -> Pace:
     """How the process `name` keeps time on this bench."""
     if bench.pace.mode == "wall":
-        return Pace()
+        return Pace(rig_clock(bench, host_of(bench, name), wire, stop))
     from softloop.wire.lockstep import Follower, Leader  # noqa: PLC0415 - no rig at wall pace needs it
 
     others = {p.name for p in processes_of(bench)} - {name}

@@ -6,7 +6,8 @@ import time
 from typing import Any
 
 from softloop.deploy.node import PROCESSES
-from softloop.wire.channels import CYCLE, EVENT, PRESSURE, STATUS, VALVES
+from softloop.wire.backlog import Backlog
+from softloop.wire.channels import CYCLE, EVENT, PRESSURE, STATUS, VALVES, key
 from softloop.wire.messages import BadPayload, constant, message, names_of
 from softloop.wire.session import Wire
 
@@ -23,8 +24,10 @@ DRIVERS = names_of("ValveStatus", "DRIVER_")
 PHASES = names_of("CycleRecord", "PHASE_")
 LOADS = {1: "payload", 2: "contact"}
 INVARIANTS = names_of("Event", "INVARIANT_")
+CLOCKS, CLOCK_DRIFT = names_of("Event", "CLOCK_"), constant("Event", "CLOCK_DRIFT")
 FAULTS = names_of("Event", "FAULT_")
 _KINDS = names_of("Event", "KIND_")
+_BACKLOG = 4096
 _SOURCE_NAMES = {constant("Event", p.source): p.name for p in PROCESSES}
 
 
@@ -35,8 +38,8 @@ class RigState:
         self._cycles = wire.latest(CYCLE)
         self._valves = wire.latest(VALVES)
         self._pressures = wire.latest(PRESSURE)
-        self._statuses = wire.inbox(STATUS)
-        self._events = wire.inbox(EVENT)
+        # Not by callbacks: where the launcher is the meeting point, Zenoh's threads must not wait for its Python.
+        self._statuses, self._events = (Backlog(wire.session, key(wire.bench, c), _BACKLOG) for c in (STATUS, EVENT))
         self.cycle: Any = None
         self.valves: Any = None
         self.pressure: Any = None
@@ -53,11 +56,11 @@ class RigState:
             self.valves_heard_ns = time.monotonic_ns()
             self.valves = _newest(payload, "ValveStatus", self.valves)
             self.was_armed |= self.valves is not None and self.valves.gate != GATE_DISARMED
-        for _, payload in self._statuses.take_all():
+        for _, payload in self._statuses.take_all()[0]:
             status = _newest(payload, "ProcessStatus", None)
             if status is not None and status.process in _SOURCE_NAMES:
                 self.statuses[_SOURCE_NAMES[status.process]] = status
-        events = (_newest(payload, "Event", None) for _, payload in self._events.take_all())
+        events = (_newest(payload, "Event", None) for _, payload in self._events.take_all()[0])
         return [self.event_line(event) for event in events if event is not None]
 
     @property
@@ -122,6 +125,11 @@ def _event_text(event: Any) -> str:
     if kind == "process":
         name = _SOURCE_NAMES.get(event.reason, "a viewer")
         return f"{name} is back after {event.value:.1f} s" if event.code else f"{name} was lost"
+    if kind == "clock":
+        unit = "ppm" if event.code == CLOCK_DRIFT else "ms"
+        return f"clock of host {event.reason}: {CLOCKS.get(event.code, event.code)} ({event.value:.4g} {unit})"
+    if kind == "router":
+        return f"the meeting point is back after {event.value:.1f} s" if event.code else "the meeting point was lost"
     if kind == "driver":
         return f"valve driver {DRIVERS.get(event.code, event.code)}"
     if kind == "bus":

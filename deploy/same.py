@@ -8,7 +8,7 @@ from pathlib import Path
 
 from softloop.deploy.batch import rig_tables
 from softloop.deploy.bench import Bench, load_bench
-from softloop.deploy.launcher import schedule_of
+from softloop.deploy.lockstep_launch import schedule_of
 from softloop.deploy.run_dir import BENCH_FILE
 from softloop.offline.closed_loop import Trace, ready_controller, simulate_trace
 from softloop.offline.log import Log

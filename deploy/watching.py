@@ -85,7 +85,7 @@ def echo(text: str, bench_file: Path, count: int | None, rate_hz: float | None, 
     choice = choose(bench.name, text)
     line = writer(choice, json_lines=json_lines)
     with stop_on_signals() as stop, guest_wire(bench.zenoh, bench.name, f"echo-{os.getpid()}") as wire:
-        inbox = Inbox(wire.session, choice.key_expr, CAPACITY)
+        inbox = Inbox(wire.session, choice.key_expr, capacity=CAPACITY)
         printed, heard_s = 0, time.monotonic()
         while not stop and (count is None or printed < count):
             item = inbox.take(POLL_S)

@@ -19,7 +19,7 @@ from softloop.devices.protocols.wt931 import (
     SamplerConfig,
     sampler_config,
 )
-from softloop.wire.benchfile import Table
+from softloop.wire.benchfile import ProcessTable, Table
 from softloop.wire.can_config import CanConfig
 from softloop.wire.channels import COMMAND
 from softloop.wire.errors import BadConfig
@@ -28,7 +28,7 @@ PERIOD_NS = round(1e9 / COMMAND.rate_hz)
 ANALOG_DLC = 8
 
 
-class ValvesConfig(Table):
+class ValvesConfig(ProcessTable):
     """`[valves]`: the safety gate and its valve driver."""
 
     can: str = Field("can0", description="which [can.NAME] the valve driver is on")
@@ -82,7 +82,7 @@ class SensorConfig(Table):
         return self
 
 
-class PressuresConfig(Table):
+class PressuresConfig(ProcessTable):
     """`[pressures]`: the analogue module with the two pressure sensors."""
 
     can: str = Field("can0", description="which [can.NAME] the analogue module is on")
@@ -91,7 +91,7 @@ class PressuresConfig(Table):
     chamber: SensorConfig = SensorConfig()
 
 
-class InclinometerConfig(Table):
+class InclinometerConfig(ProcessTable):
     """`[inclinometer]`: the WT931 on a serial port."""
 
     port: str = Field(min_length=1, description="a device such as /dev/ttyUSB0, or a pyserial URL")

@@ -16,7 +16,7 @@ from softloop.devices.gate_messages import STATUS as STATUS_DTYPE
 from softloop.devices.protocols import can_frames
 from softloop.wire.can_config import open_port
 from softloop.wire.can_port import CanPort
-from softloop.wire.channels import COMMAND, REQUEST, VALVES
+from softloop.wire.channels import ARM, COMMAND, REQUEST, VALVES, key
 from softloop.wire.errors import Lost
 from softloop.wire.messages import BadPayload, constant, message, names_of
 from softloop.wire.pace import WIRE_DRIVER
@@ -74,7 +74,8 @@ class ValvesLoop:
         self.lost: Lost | None = None
         self._warm()
         self.commands = context.pace.commands(context.wire.inbox(COMMAND))
-        self.requests = context.pace.requests(context.wire.inbox(REQUEST))
+        self.requests = context.pace.requests(context.wire.inbox(REQUEST, ARM))
+        self.arm_key = key(context.bench, ARM)
         self.driver_frames = context.frames(port, WIRE_DRIVER)
         self.sender = context.faults.sender(port)
         self.put = context.wire.publisher(VALVES)
@@ -128,10 +129,14 @@ class ValvesLoop:
         """Requests, and what the driver and the bus say."""
         given = self.given
         given.stop = given.disarm = given.arm = 0
-        for _, payload in self.requests.take_all():
+        for full_key, payload in self.requests.take_all():
             try:
                 request = _REQUEST.unpack(payload)
             except BadPayload:
+                self.status.dropped += 1
+                continue
+            # Access rules go by keys: who may only stop the rig shall not arm it under another key.
+            if (request.action == _ARM) != (full_key == self.arm_key):
                 self.status.dropped += 1
                 continue
             given.stop |= _STOPS.get(request.action, 0)

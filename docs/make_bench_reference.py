@@ -29,9 +29,16 @@ UNITS = {
 ENDINGS = {
     "_deg_s2": "deg/s2", "_kpa_s": "kPa/s", "_deg_s": "deg/s", "_ma_per_tick": "mA per tick", "_ticks": "ticks of 5 ms",
     "_kpa": "kPa", "_deg": "deg", "_kib": "KiB", "_mib": "MiB", "_ma": "mA", "_hz": "Hz", "_ms": "ms", "_us": "us",
-    "_s": "s", "_v": "V",
+    "_s": "s", "_v": "V", "_ppm": "ppm",
 }  # fmt: skip
-TYPES = {"string": "text", "integer": "whole number", "number": "number", "boolean": "true or false", "object": "table"}
+TYPES = {
+    "string": "text",
+    "integer": "whole number",
+    "number": "number",
+    "boolean": "true or false",
+    "object": "table",
+    "array": "list",
+}
 # Keys whose values a model's own check holds to what the WT931 can do.
 DEVICE_TABLES = ("InclinometerConfig", "PlantConfig")
 DEVICE_CODES = {"baud": BAUD_CODES, "configure_baud": BAUD_CODES, "rate_hz": RATE_CODES, "bandwidth_hz": BANDWIDTH_CODES}

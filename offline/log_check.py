@@ -119,7 +119,8 @@ def _seconds(stamp_ns: int, start_ns: int) -> float:
 
 def _sequences(log: Log, start_ns: int) -> Iterator[tuple[str, int, NDArray[Any], NDArray[np.float64]]]:
     """Topic, sender, numbers and stamps of each sender that counts for itself, in the order of the log."""
-    by_message = {"event": "Event", "status": "ProcessStatus", "request": "GateRequest"}
+    by_message = {"event": "Event", "status": "ProcessStatus", "clock": "ClockOffset"}
+    by_message |= dict.fromkeys(("request", "arm"), "GateRequest")
     for name, records in sorted(log.channels.items()):
         sender_field = SENDER_FIELDS.get(by_message.get(name, ""))
         if _counts(records, *([sender_field] if sender_field else [])):

@@ -75,6 +75,8 @@ def _meanings() -> dict[str, str]:
         "gate_faults": "transitions of the gate to FAULT",
         "gate_fault_reasons": "their reasons, separated by '; '",
         "driver_watchdog_trips": "times at which the valve driver vented by itself",
+        "clock_uncertainty_max_ms": "largest stated uncertainty of a host's clock against the rig's; empty with one host",
+        "clock_steps": "jumps of a host's clock against the rig's",
         "events": "events in the log",
     }
     for kind, of in (("truth", "the plant's true angle"), ("sensor", "the inclinometer's angle")):
@@ -102,7 +104,7 @@ MEANINGS = _meanings()
 def summarise(log: Log) -> dict[str, Value]:
     """All figures of a run: keys and meanings as in `MEANINGS`, None where the log has nothing to take one from."""
     found: dict[str, Value] = {"bench": log.bench, **_from_bench_file(log)}
-    found |= _course(log) | _tracking(log) | _timing(log) | _latency(log) | _losses(log) | _plant(log) | _gate(log)
+    found |= _course(log) | _tracking(log) | _timing(log) | _latency(log) | _losses(log) | _plant(log) | _gate(log) | _clocks(log)
     found["recorder_dropped"] = None
     problems = evidence_problems(found)
     return {**found, "evidence_valid": not problems, "evidence_problems": "; ".join(problems)}
@@ -117,6 +119,7 @@ def evidence_problems(found: dict[str, Any]) -> list[str]:
         (found["missing_cycle"] > 0, f"{found['missing_cycle']} cycle records are missing"),
         (found["missing_truth"] > 0, f"{found['missing_truth']} truth records are missing"),
         (bool(found["log_problems"]), "the log file is damaged or unfinished"),
+        (found["clock_steps"] > 0, "a host's clock jumped"),
         (bool(found["silent_channels"]), f"a channel is silent: {found['silent_channels']}"),
     )
     return [text for bad, text in checks if bad]
@@ -199,6 +202,13 @@ def _plant(log: Log) -> dict[str, Value]:
         return {"plant_late_max_ms": None, "plant_deadline_misses": None}
     misses = truth["deadline_misses"]
     return {"plant_late_max_ms": float(truth["late_max_ns"].max()) * 1e-6, "plant_deadline_misses": int(misses[-1] - misses[0])}
+
+
+def _clocks(log: Log) -> dict[str, Value]:
+    words, events = log["clock"], log["event"]
+    steps = (events["kind"] == constant("Event", "KIND_CLOCK")) & (events["code"] == constant("Event", "CLOCK_STEP"))
+    worst_ms = float(words["uncertainty_ns"].max()) * 1e-6 if len(words) else None
+    return {"clock_uncertainty_max_ms": worst_ms, "clock_steps": int(np.count_nonzero(steps))}
 
 
 def _gate(log: Log) -> dict[str, Value]:

@@ -9,7 +9,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from softloop.devices.protocols.wt931 import BANDWIDTH_CODES, BAUD_CODES, RATE_CODES
-from softloop.wire.benchfile import Table
+from softloop.wire.benchfile import ProcessTable, Table
 from softloop.wire.can_config import CanConfig
 from softloop.wire.errors import BadConfig
 
@@ -72,7 +72,7 @@ class FaultConfig(Table):
         return self
 
 
-class PlantConfig(Table):
+class PlantConfig(ProcessTable):
     """`[plant]`: which rig is simulated, and on which wires."""
 
     layer: Literal["ideal", "rig"] = Field("rig", description="ideal: the controller's own model; rig: also what that leaves out")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from ipaddress import ip_address
+from typing import Literal
 
 from pydantic import Field, model_validator
 
-from softloop.wire.benchfile import Table
+from softloop.wire.benchfile import ProcessTable, Table
 
 
-class RecorderConfig(Table):
+class RecorderConfig(ProcessTable):
     """`[recorder]`: what the log keeps, and how much the recorder may hold back before it has to drop."""
 
     file: str = Field("run.mcap", pattern=r"^[A-Za-z0-9_.-]+\.mcap$", description="name of the log in the run's directory")
@@ -20,9 +21,13 @@ class RecorderConfig(Table):
     backlog_messages: int = Field(100_000, ge=1, le=10_000_000, description="messages waiting; beyond it the oldest go")
     unwritten_mib: int = Field(64, ge=1, le=4096, description="bytes the disk did not take yet; beyond it new messages go")
     drain_s: float = Field(3.0, ge=0, le=60, description="time allowed at the end for what is still waiting")
+    budget_mib: int = Field(0, ge=0, description="disk space for this bench's runs in [run] folder; 0: no limit")
+    over_budget: Literal["refuse", "remove"] = Field(
+        "refuse", description="refuse: no new run; remove: the oldest runs go, never one that is in use or holds a file `keep`"
+    )
 
 
-class MonitorConfig(Table):
+class MonitorConfig(ProcessTable):
     """`[monitor]`: the invariants that a process watches at wall pace, and whether it faults the gate when one does not hold."""
 
     faults_gate: bool = Field(False, description="an invariant that does not hold leads the gate to FAULT, reason `invariant`")

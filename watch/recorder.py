@@ -13,6 +13,8 @@ directory says it all. A recorder that is started again in a run writes the log'
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
 import time
@@ -61,6 +63,8 @@ class Sink:
             self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
         except OSError as error:
             raise Unavailable(f"{path}: cannot be written: {error.strerror or error}") from None
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(self._file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # whoever keeps a disk budget sees that it is being written
         self._waiting = bytearray()
         self.stored = 0
 

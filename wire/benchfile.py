@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from softloop.wire.errors import BadConfig, BadFile
 
@@ -16,6 +16,12 @@ class Table(BaseModel):
     """Base of every table of a bench or parameter file: unknown keys are errors, values do not change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ProcessTable(Table):
+    """Base of the tables that make a process run."""
+
+    host: str = Field("", description="which [hosts.NAME] it runs on; empty: a bench of one host")
 
 
 T = TypeVar("T", bound=BaseModel)

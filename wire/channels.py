@@ -34,14 +34,16 @@ PRESSURE = Channel("pressure", "PressureSample", 200.0, 20 * MS, realtime=True)
 INCLINATION = Channel("inclination", "InclinationSample", 200.0, 30 * MS, realtime=True)
 COMMAND = Channel("command", "ValveCommand", 200.0, 15 * MS, realtime=True)
 VALVES = Channel("valves", "ValveStatus", 200.0, 50 * MS, realtime=True)
-REQUEST = Channel("request", "GateRequest", 0.0)
+REQUEST = Channel("request", "GateRequest", 0.0)  # to disarm, stop, or go to FAULT: whoever has a right on the bench may ask
+ARM = Channel("arm", "GateRequest", 0.0)  # to arm, and nothing else: a key of its own, so that access rules can tell
 EVENT = Channel("event", "Event", 0.0)
 CYCLE = Channel("cycle", "CycleRecord", 200.0)
 TRUTH = Channel("truth", "PlantTruth", 200.0)
 STATUS = Channel("status", "ProcessStatus", 1.0)
+CLOCK = Channel("clock", "ClockOffset", 10.0)  # with several hosts: from each but that of the controller
 CAN = Channel("can", "CanFrame", 600.0, realtime=True)  # key: can/<bus>/<arbitration id in hex>
 
-CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, EVENT, CYCLE, TRUTH, STATUS, CAN)
+CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, ARM, EVENT, CYCLE, TRUTH, STATUS, CLOCK, CAN)
 
 # Asked for and answered, not published (`wire.questions`): a fault for the simulated rig, answered by the plant alone.
 FAULT = Channel("fault", "FaultRequest", 0.0, logged=False)
@@ -53,6 +55,11 @@ TICK = Channel("tick", "Tick", 200.0, realtime=True, logged=False)
 HELLO = Channel("hello", "Watermark", 0.0, realtime=True, logged=False)
 WATERMARK = Channel("watermark", "Watermark", 200.0, realtime=True, logged=False)
 END = Channel("end", "Watermark", 0.0, realtime=True, logged=False)
+
+# Between the launchers of a bench's hosts, on keys of their own too: their words, and the question for the time.
+HOSTS_ROOT = "softloop-hosts"
+HOST = Channel("host", "HostStatus", 5.0, logged=False)
+TIME = "time"
 
 
 def key(bench: str, channel: Channel) -> str:
@@ -73,6 +80,16 @@ def alive_key(bench: str, process: str) -> str:
 def pace_key(bench: str, channel: Channel, process: str) -> str:
     """Key on which a process says at lockstep pace what `channel` carries: `softloop-pace/<bench>/<channel>/<process>`."""
     return f"{PACE_ROOT}/{bench}/{channel.name}/{process}"
+
+
+def host_key(bench: str, host: str) -> str:
+    """Key on which the launcher of a host speaks to the others: `softloop-hosts/<bench>/host/<host>`."""
+    return f"{HOSTS_ROOT}/{bench}/{HOST.name}/{host}"
+
+
+def time_key(bench: str) -> str:
+    """Key on which the controller's host answers what its clock says: `softloop-hosts/<bench>/time`."""
+    return f"{HOSTS_ROOT}/{bench}/{TIME}"
 
 
 def channel_of_key(bench: str, full_key: str) -> Channel | None:

@@ -8,6 +8,7 @@ a change of any of them makes a new folder, and a change of what a kernel cannot
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
@@ -21,6 +22,8 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 from numba import types
+
+from softloop.wire.errors import Unavailable
 
 _numba_config: Any = numba.config  # its attributes are made at import; the type checker sees none
 
@@ -81,6 +84,19 @@ def cache_dir(file: Path, root: Path) -> Path:
     return cache_root() / f"{file.stem}-{source_hash(sources_of(file, root))}"
 
 
+def _usable(folder: Path) -> str:
+    """A cache folder, made where it is not there yet. Raises Unavailable when this user cannot keep anything in it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise Unavailable(
+            f"{cache_root()}: compiled kernels cannot be kept there ({error.strerror}); let XDG_CACHE_HOME name a folder of yours"
+        ) from None
+    return str(folder)
+
+
 def _home(function: Callable[..., Any]) -> tuple[Path, Path]:
     """The file of the module that calls for `function` to be compiled, and the folder of its top-level package or module."""
     module = sys.modules[sys._getframe(2).f_globals["__name__"]]
@@ -92,12 +108,15 @@ def kernel(*signatures: Any) -> Callable[[F], F]:
     """Compile a pure function for the given explicit signature(s), cached as this module's text says.
 
     No fastmath, no parallel: equal inputs give equal bytes (within one installation). Division by zero gives inf or nan,
-    as in numpy. With `NUMBA_DISABLE_JIT=1` (numba's own switch) the plain function is returned.
+    as in numpy. With `NUMBA_DISABLE_JIT=1` (numba's own switch) the plain function is returned. Raises Unavailable, as its
+    module is imported, when the cache folder cannot be written.
     """
 
     def decorate(function: F) -> F:
+        if _numba_config.DISABLE_JIT:
+            return function
         before = _numba_config.CACHE_DIR
-        _numba_config.CACHE_DIR = str(cache_dir(*_home(function)))
+        _numba_config.CACHE_DIR = _usable(cache_dir(*_home(function)))
         try:
             compiled = numba.njit(list(signatures), cache=True, nogil=True, error_model="numpy", fastmath=False)(function)
         finally:

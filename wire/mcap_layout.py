@@ -32,11 +32,17 @@ METADATA_NAME = "softloop"
 LIBRARY = "softloop"
 CHUNK_BYTES = 64 * 1024  # closing a chunk of this size takes about a millisecond; one of 1 MiB takes fifteen
 # Attached from the run's directory when they stand there; versions.json and git.json are made here.
-RUN_FILES = ("bench.toml", "rig.dbc", "parameters.toml")
+RUN_FILES = ("bench.toml", "rig.dbc", "parameters.toml", "certificate.json")
 MEDIA_TYPES = {".toml": "application/toml", ".json": "application/json"}
 LIBRARIES = ("softloop", "numpy", "numba", "eclipse-zenoh")
 # Channels on which several senders count for themselves, and the field that tells them apart.
-SENDER_FIELDS = {"Event": "source", "ProcessStatus": "process", "GateRequest": "origin", "CanFrame": "node"}
+SENDER_FIELDS = {
+    "Event": "source",
+    "ProcessStatus": "process",
+    "GateRequest": "origin",
+    "CanFrame": "node",
+    "ClockOffset": "host",
+}
 
 _HEAD = struct.Struct("<Qq")  # every message begins with seq and stamp_ns
 _U64_END = 1 << 64

@@ -57,8 +57,10 @@ def ask(wire: Wire, channel: Channel, payload: bytes, timeout_s: float) -> None:
 
     Raises:
         BadConfig: refused, with the answer's words.
-        Unavailable: nobody answers on this channel.
+        Unavailable: nobody answers on this channel, or there is no right to ask.
     """
+    if wire.identity is not None and not wire.identity.rights.may_ask(channel.name):
+        raise wire.refused("ask on", channel)
     replies = wire.session.get(
         key(wire.bench, channel), payload=payload, timeout=timeout_s, congestion_control=zenoh.CongestionControl.BLOCK
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import sys
 import threading
 import time
 import zlib
@@ -18,8 +19,10 @@ import zenoh
 
 from softloop.wire.backlog import Backlog
 from softloop.wire.channels import ROOT, Channel, alive_key, key
-from softloop.wire.config import ZenohConfig
+from softloop.wire.config import TLS, ZenohConfig
 from softloop.wire.errors import Unavailable
+from softloop.wire.identity import Identity, identity_of
+from softloop.wire.rights import RIGHTS, ROUTER
 
 UNIX = "unixsock-stream/"
 CLIENT_PATIENCE_MS = 10_000
@@ -28,11 +31,32 @@ SETTLE_AT_MOST_S = 3.0
 
 
 def make_config(
-    mode: str, listen: list[str], connect: list[str], lease_ms: int, *, listen_must_work: bool = True
+    mode: str,
+    listen: list[str],
+    connect: list[str],
+    lease_ms: int,
+    *,
+    listen_must_work: bool = True,
+    identity: Identity | None = None,
 ) -> zenoh.Config:
     """The one way to a Zenoh configuration: nothing is left to Zenoh's defaults that reaches beyond this machine."""
     config = zenoh.Config()
-    settings: dict[str, Any] = {
+    for name, value in settings_of(mode, listen, connect, lease_ms, listen_must_work=listen_must_work, identity=identity).items():
+        config.insert_json5(name, json.dumps(value))
+    return config
+
+
+def settings_of(
+    mode: str,
+    listen: list[str],
+    connect: list[str],
+    lease_ms: int,
+    *,
+    listen_must_work: bool = True,
+    identity: Identity | None = None,
+) -> dict[str, Any]:
+    """The settings in `make_config`, by the path of each."""
+    return (identity.settings if identity else {}) | {
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
@@ -53,10 +77,8 @@ def make_config(
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
         "transport/shared_memory/enabled": False,
         "timestamping/enabled": False,
+        "adminspace/enabled": False,
     }
-    for name, value in settings.items():
-        config.insert_json5(name, json.dumps(value))
-    return config
 
 
 def _patience_ms(mode: str, *, listen_must_work: bool) -> int:
@@ -70,25 +92,43 @@ def _patience_ms(mode: str, *, listen_must_work: bool) -> int:
     return -1 if listen_must_work else 0
 
 
-def own_endpoint(meeting_point: str, process: str) -> str:
-    """Where a peer listens for direct links: beside the meeting point, on a socket or port of its own."""
+def own_endpoint(meeting_point: str, process: str, address: str = "") -> str:
+    """Where a peer listens for direct links: beside the meeting point, or at `address`, on a socket or port of its own."""
     if meeting_point.startswith(UNIX):
         folder = Path(meeting_point[len(UNIX) :]).parent
         return f"{UNIX}{folder}/{Path(meeting_point).stem}.{process}.{os.getpid()}.sock"
+    if address:
+        shown = f"[{address}]" if ":" in address and not address.startswith("[") else address
+        return f"{meeting_point.split('/', 1)[0]}/{shown}:0"
     return meeting_point.rsplit(":", 1)[0] + ":0"
 
 
 def open_session(config: ZenohConfig, bench: str, process: str) -> zenoh.Session:
-    """A session of one process on a bench. Raises Unavailable when it cannot listen."""
+    """A session of one process on a bench. Raises Unavailable when it cannot listen, or has no good identity."""
+    return _open_as(_known(config, bench, process), config, bench, process)
+
+
+def _known(config: ZenohConfig, bench: str, process: str) -> Identity | None:
+    """Who this is; what is soon to be wrong with that is said."""
+    identity = identity_of(config, bench, process)
+    if identity is not None and identity.warning:
+        sys.stderr.write(f"[{process}] {identity.warning}\n")
+    return identity
+
+
+def _open_as(identity: Identity | None, config: ZenohConfig, bench: str, process: str) -> zenoh.Session:
     meet = config.meeting_point(bench)
-    listen = [own_endpoint(meet, process)] if config.mode == "peer" else []
-    return _open(make_config(config.mode, listen, [meet], config.lease_ms), meet)
+    # A person's certificate is none to be connected to.
+    peer = config.mode == "peer" and (identity is None or identity.name in RIGHTS)
+    listen = [own_endpoint(meet, process, config.listen)] if peer else []
+    return _open(make_config("peer" if peer else "client", listen, [meet], config.lease_ms, identity=identity), meet)
 
 
 def open_router(config: ZenohConfig, bench: str) -> zenoh.Session:
-    """The meeting point itself. Raises Unavailable when its address is taken."""
+    """The meeting point itself. Raises Unavailable when its address is taken, or it has no good identity."""
     meet = config.meeting_point(bench)
-    return _open(make_config("router", [meet], [], config.lease_ms), meet)
+    identity = _known(config, bench, ROUTER)
+    return _open(make_config("router", [meet], [], config.lease_ms, identity=identity), meet)
 
 
 def open_meeting(bench: str, endpoint: str, lease_ms: int = 5000) -> zenoh.Session:
@@ -104,7 +144,14 @@ def _open(config: zenoh.Config, where: str) -> zenoh.Session:
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise Unavailable(f"Zenoh endpoint {where}: {_short(error)}") from None
+        raise Unavailable(f"Zenoh endpoint {where}: {_short(error)}{_hint(where, str(error))}") from None
+
+
+def _hint(where: str, text: str) -> str:
+    """Zenoh does not say why a link over TLS does not come about."""
+    if not where.startswith(TLS) or "connect" not in text:
+        return ""
+    return "; nobody is there, or its certificate is of another authority, expired, or not of this address"
 
 
 def _check_socket_path(path: str) -> None:
@@ -135,16 +182,17 @@ class Latest:
 
 
 class Inbox:
-    """All samples of a key expression in order, with a wake-up: for loops that act on arrival.
+    """All samples of a key expression, or of several, in order, with a wake-up: for loops that act on arrival.
 
     Bounded: when nobody takes, the oldest go and are counted in `dropped`.
     """
 
-    def __init__(self, session: zenoh.Session, key_expr: str, capacity: int = 4096) -> None:
+    def __init__(self, session: zenoh.Session, *key_exprs: str, capacity: int = 4096) -> None:
         self._items: deque[tuple[str, bytes]] = deque(maxlen=capacity)
         self._ready = threading.Condition()
         self.dropped = self.received = 0
-        self._subscriber = session.declare_subscriber(key_expr, zenoh.handlers.Callback(self._receive, indirect=False))
+        handler = zenoh.handlers.Callback(self._receive, indirect=False)
+        self._subscribers = [session.declare_subscriber(one, handler) for one in key_exprs]
 
     def _receive(self, sample: zenoh.Sample) -> None:
         with self._ready:
@@ -178,10 +226,12 @@ class Wire:
         exact: at lockstep pace: who sends waits for who reads, and equal runs give equal bytes.
         on_put: told of each payload on a channel of the 5 ms path before it is sent.
         spoil: changes how a channel is published, where faults are injected into it.
+        identity: who this is on a secured bench. Zenoh refuses in silence; what is asked for here is refused with a word.
     """
 
-    def __init__(self, session: zenoh.Session, bench: str, process: str) -> None:
+    def __init__(self, session: zenoh.Session, bench: str, process: str, identity: Identity | None = None) -> None:
         self.session = session
+        self.identity = identity
         self.bench = bench
         self.process = process
         self.exact = False
@@ -190,7 +240,12 @@ class Wire:
         self._token: Any = None
 
     def publisher(self, channel: Channel) -> Callable[[bytes], None]:
-        """A function that publishes a payload on a channel. At wall pace it never waits: what cannot be sent is dropped."""
+        """A function that publishes a payload on a channel. At wall pace it never waits: what cannot be sent is dropped.
+
+        Raises Unavailable when this process has no right to.
+        """
+        if not self.may_put(channel):
+            raise self.refused("publish on", channel)
         publisher = self.declare_publisher(key(self.bench, channel), realtime=channel.realtime)
         put: Callable[[bytes], None] = publisher.put
         put = self._noted(put) if channel.realtime and self.on_put else put
@@ -203,6 +258,19 @@ class Wire:
             put(payload)
 
         return put_noted
+
+    def may_put(self, channel: Channel) -> bool:
+        """Whether this process has the right to publish on a channel."""
+        return self.identity is None or self.identity.rights.may_put(channel.name)
+
+    def refused(self, what: str, channel: Channel) -> Unavailable:
+        """What is said where a right is missing."""
+        who = "nobody" if self.identity is None else self.identity.name
+        return Unavailable(f"identity '{who}' has no right to {what} '{channel.name}' of bench '{self.bench}'")
+
+    def _may_hear(self, channel: Channel) -> None:
+        if self.identity is not None and not self.identity.rights.may_hear(channel.name):
+            raise self.refused("hear", channel)
 
     @property
     def congestion(self) -> zenoh.CongestionControl:
@@ -226,12 +294,15 @@ class Wire:
         )
 
     def latest(self, channel: Channel) -> Latest:
-        """The newest sample of a channel: what a control input is."""
+        """The newest sample of a channel: what a control input is. Raises Unavailable without the right to it."""
+        self._may_hear(channel)
         return Latest(self.session, key(self.bench, channel))
 
-    def inbox(self, channel: Channel) -> Inbox:
-        """All samples of a channel in order, with a wake-up."""
-        return Inbox(self.session, key(self.bench, channel))
+    def inbox(self, *channels: Channel) -> Inbox:
+        """All samples of a channel, or of several, in order, with a wake-up. Raises Unavailable without the right to them."""
+        for channel in channels:
+            self._may_hear(channel)
+        return Inbox(self.session, *(key(self.bench, channel) for channel in channels))
 
     def everything(self, capacity: int) -> Backlog:
         """All samples of all channels of the bench."""
@@ -267,5 +338,6 @@ class Wire:
 @contextmanager
 def open_wire(config: ZenohConfig, bench: str, process: str) -> Iterator[Wire]:
     """A `Wire` whose session is closed at the end, whatever happened."""
-    with open_session(config, bench, process) as session:
-        yield Wire(session, bench, process)
+    identity = _known(config, bench, process)
+    with _open_as(identity, config, bench, process) as session:
+        yield Wire(session, bench, process, identity)

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 from softloop.deploy.bench import load_bench
-from softloop.wire.channels import COMMAND, CYCLE, PRESSURE, REQUEST, STATUS, VALVES
+from softloop.wire.channels import ARM, COMMAND, CYCLE, PRESSURE, REQUEST, STATUS, VALVES
 from softloop.wire.errors import Unavailable
 from softloop.wire.messages import constant, message
 from softloop.wire.shell import run_process
@@ -78,7 +78,7 @@ class Gate(Idle):
     def __init__(self, context, wrong):
         super().__init__(context, wrong)
         self.put = self.wire.publisher(VALVES)
-        self.requests = self.wire.inbox(REQUEST)
+        self.requests = self.wire.inbox(REQUEST, ARM)
         self.gate = DISARMED
         self.reason = self.armed_steps = 0
 

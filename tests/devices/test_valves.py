@@ -10,6 +10,7 @@ from softloop.devices import valves
 from softloop.devices.protocols import can_frames as cf
 from softloop.wire.can_config import CanConfig, open_port
 from softloop.wire.can_frame import ERROR_BUS_OFF, FLAG_ERROR
+from softloop.wire.channels import ARM as ARM_CHANNEL
 from softloop.wire.channels import COMMAND, REQUEST, VALVES
 from softloop.wire.clock import WallClock
 from softloop.wire.errors import Unavailable
@@ -31,7 +32,8 @@ class Rig:
         self.port = open_port(CanConfig(), "can0", wire, CLOCK, [cf.VALVE_COMMAND_ID])
         self.judge = cf.E2eReceiver(cf.VALVE_COMMAND_ID, 1)
         self.frames, self.verdicts = [], []
-        self.put_command, self.put_request = wire.publisher(COMMAND), wire.publisher(REQUEST)
+        self.put_command = wire.publisher(COMMAND)
+        self.put_request, self.put_arm = wire.publisher(REQUEST), wire.publisher(ARM_CHANNEL)
         self.valves, self.events, self.status = listeners(wire, VALVES)
         self.seq = self.requests = self.counter = 0
         self.driver = True
@@ -60,10 +62,11 @@ class Rig:
             self.verdicts.append(self.judge.judge(frame.data))
             self.frames.append(cf.decode_valve_command(frame.data))
 
-    def request(self, action):
+    def request(self, action, put=None):
         self.requests += 1
         request = message("GateRequest")
-        self.put_request(request.pack(request.make(seq=self.requests, stamp_ns=CLOCK.now_ns(), origin=2**63 + 5, action=action)))
+        put = put or (self.put_arm if action == ARM else self.put_request)
+        put(request.pack(request.make(seq=self.requests, stamp_ns=CLOCK.now_ns(), origin=2**63 + 5, action=action)))
 
     def until(self, condition, **fields):
         return until(lambda: self.turn(**fields) or condition())
@@ -198,3 +201,16 @@ def test_a_bus_that_is_not_there_is_one_line(meet, tmp_path):
     config = replace(CONFIG, bus=CanConfig(interface="socketcan", channel="nosuchcan"))
     with bench(meet) as (a, _), pytest.raises(Unavailable, match=r"^CAN bus socketcan:nosuchcan: [^\n]+$"):
         run_to_its_end(valves.run, config, a, tmp_path)
+
+
+def test_a_request_under_a_key_that_is_not_its_own_is_thrown_away(rig):
+    rig.until(lambda: rig.newest("gate") == g.GATE_DISARMED)
+    rig.request(ARM, rig.put_request)
+    rig.until(lambda: any(status.dropped for status in rig.status.look()))
+    assert rig.newest("gate") == g.GATE_DISARMED
+    rig.arm()
+    for action in (STOP, constant("GateRequest", "ACTION_DISARM"), constant("GateRequest", "ACTION_FAULT")):
+        rig.request(action, rig.put_arm)
+    for _ in range(20):
+        rig.turn()
+    assert rig.newest("gate") == g.GATE_ARMED

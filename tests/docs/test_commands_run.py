@@ -20,14 +20,15 @@ from tests.wire.rendezvous import short_folder
 
 from softloop.deploy.bench import shipped_benches
 
-pytestmark = pytest.mark.rig
+pytestmark = pytest.mark.commands
 
 LIMIT_S = 120.0
 STOP = ["request", "sim", "stop"]
 FIRST = ["run", "sim", "--page", "--run-dir", "runs/first"]
 SECOND = ["run", "pid.toml", "--run-dir", "runs/second"]
 BESIDE = ("top", "echo", "page", "foxglove", "request")
-ON_LOGS = ("plot", "report", "compare", "replay")
+ON_LOGS = ("plot", "report", "compare", "replay", "keys")
+ELSEWHERE = ("doctor", "install", "log")  # in tests of their own
 STANDS_FOR = {"runs/<run>": "runs/first", "runs/RUN": "runs/first", "runs/RUN_A": "runs/first", "runs/RUN_B": "runs/second"}
 # What is long in the documentation is short here: these words are added, or stand in for others.
 LESS = {
@@ -51,6 +52,10 @@ def commands(*names):
 def less(command):
     """A command with fewer numbers, and its placeholders replaced."""
     more, instead = LESS.get(command[0], ([], {}))
+    if "--faults" in command:
+        more = []  # the scenario says how long
+    if command[0] == "faults" and all(word.startswith("-") for word in command[1:]):
+        more = ["can_bus_off"]  # of all the shipped ones
     return [instead.get(STANDS_FOR.get(word, word), STANDS_FOR.get(word, word)) for word in command] + more
 
 
@@ -69,6 +74,10 @@ class Place:
             )
         text = re.search(r"^```toml\n(.*?)^```", (ROOT / "docs" / "tutorial.md").read_text(), re.S | re.M)[1]
         (folder / "pid.toml").write_text(text)
+        text = re.search(r"^```toml\n(.*?)^```", (ROOT / "docs" / "faults.md").read_text(), re.S | re.M)[1]
+        (folder / "bad_cable.toml").write_text(text)
+        text = re.search(r"^```toml\n(.*?)^```", (ROOT / "docs" / "security.md").read_text(), re.S | re.M)[1]
+        (folder / "rig.toml").write_text(text)
 
     def start(self, words, output):
         command = [sys.executable, "-m", "softloop.deploy.cli", *words]
@@ -163,7 +172,7 @@ def test_a_run(place, command):
     assert code == 0, said
 
 
-@pytest.mark.parametrize("command", commands(*ON_LOGS, "batch"))
+@pytest.mark.parametrize("command", commands(*ON_LOGS, "batch", "faults"))
 def test_on_what_is_there(place, command):
     code, said = place.run(less(command))
     assert code == 0, said
@@ -171,5 +180,5 @@ def test_on_what_is_there(place, command):
 
 def test_every_command_of_the_pages_is_among_these():
     """A new kind of command on a page is a new line here."""
-    assert {command[0] for _, command in ALL} <= {"run", "batch", "check", *BESIDE, *ON_LOGS}
+    assert {command[0] for _, command in ALL} <= {"run", "batch", "check", "faults", *BESIDE, *ON_LOGS, *ELSEWHERE}
     assert all(command in [command for _, command in ALL] for command in (FIRST, SECOND, STOP))

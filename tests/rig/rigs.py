@@ -14,6 +14,7 @@ from pathlib import Path
 import psutil
 
 LIMIT_S = 120.0
+PROGRAM = (sys.executable, "-m", "softloop.deploy.cli")
 
 
 class Rig:
@@ -24,16 +25,7 @@ class Rig:
         self.run_dir = self.folder / "run"
         self.bench = self.folder / "bench.toml"
         self.bench.write_text(f'name = "{name}"\n{bench_text}')
-        command = [
-            sys.executable,
-            "-m",
-            "softloop.deploy.cli",
-            "run",
-            str(self.bench),
-            "--run-dir",
-            str(self.run_dir),
-            *arguments,
-        ]
+        command = [*PROGRAM, "run", str(self.bench), "--run-dir", str(self.run_dir), *arguments]
         # Sockets go into the folder of this test, not among those of the user's own benches.
         environment = {**os.environ, "XDG_RUNTIME_DIR": str(runtime or self.folder)}
         self.words = self.folder / "output.txt"

@@ -17,8 +17,6 @@ from softloop.wire.messages import constant, names_of
 from tests.rig.lockstep_benches import busy_cores
 from tests.rig.rigs import running
 
-pytestmark = pytest.mark.rig
-
 BENCH = f'base = "{shipped_benches()["sim"]}"\n'
 FAULTS = {name: number for number, name in names_of("Event", "FAULT_").items()}
 # A bit in each tenth byte, each twentieth frame lost, noise on an angle: all three are left to chance, on three wires.
@@ -65,6 +63,7 @@ def same(a, b):
     return subprocess.run([sys.executable, "-m", "softloop.deploy.cli", "same", str(a), str(b)], check=False).returncode
 
 
+@pytest.mark.exact
 def test_at_lockstep_pace_the_same_scenario_gives_the_same_bytes_and_another_seed_does_not(tmp_path):
     with busy_cores(), ExitStack() as stack:
         rigs = []
@@ -80,6 +79,7 @@ def test_at_lockstep_pace_the_same_scenario_gives_the_same_bytes_and_another_see
         assert [same(rigs[0].run_dir, rig.run_dir) for rig in rigs[1:]] == [0, 1]
 
 
+@pytest.mark.rig
 def test_the_command_runs_scenarios_and_judges_them(tmp_path):
     """One tick by tick that dies, and one by the clock whose gate is killed; and one that expects what does not come."""
     wrong = tmp_path / "wrong.toml"

@@ -13,7 +13,7 @@ from softloop.watch.page.app import Site
 from softloop.watch.page.feed import Feed
 from softloop.watch.page.requests import StopLine
 from softloop.watch.page.server import serve
-from softloop.wire.channels import REQUEST
+from softloop.wire.channels import ARM, REQUEST
 from softloop.wire.messages import constant, message
 from softloop.wire.shell import Stop
 from tests.watch.benches import repeating
@@ -67,7 +67,7 @@ class ToyRig:
 
     def __init__(self, speaker):
         self.speaker = speaker
-        self.inbox = speaker.wire.inbox(REQUEST)
+        self.inbox = speaker.wire.inbox(REQUEST, ARM)
         self.gate = 0
         self.requests, self.cycles = [], []
         self.used = set()

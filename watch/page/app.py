@@ -27,6 +27,7 @@ from softloop.watch.page.feed import Feed
 from softloop.watch.page.history import COLUMNS
 from softloop.watch.page.requests import Requester, StopLine, ask
 from softloop.watch.page.state import as_json, late_edges_ms
+from softloop.wire.errors import Unavailable
 
 FILES = Path(__file__).resolve().parent / "files"
 VIEWERS_MAX = 32
@@ -108,7 +109,10 @@ async def _request(site: Site, request: Request) -> Response:
         return JSONResponse({"error": f"no request '{action}'"}, 404)
     if site.requester is None:
         return JSONResponse({"obeyed": False, "error": "no gate was heard yet"}, 503)
-    obeyed = await ask(site.requester.send, site.feed.gate, action)
+    try:
+        obeyed = await ask(site.requester.send, site.feed.gate, action)
+    except Unavailable as error:
+        return JSONResponse({"obeyed": False, "error": str(error)}, 403)
     return JSONResponse({"obeyed": obeyed})
 
 

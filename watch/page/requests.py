@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from softloop.wire.channels import REQUEST, VALVES, key
+from softloop.wire.channels import ARM, REQUEST, VALVES, key
 from softloop.wire.messages import BadPayload, constant, message
 from softloop.wire.session import Latest, Wire
 
@@ -35,19 +35,23 @@ class Requester:
 
     def __init__(self, wire: Wire) -> None:
         self.wire = wire
-        self._publisher = wire.declare_publisher(key(wire.bench, REQUEST), realtime=True)
+        channels = (c for c in (REQUEST, ARM) if wire.may_put(c))
+        self._publishers = {c.name: wire.declare_publisher(key(wire.bench, c), realtime=True) for c in channels}
         self._origin = secrets.randbits(63)
-        self._seq = 0
+        self._seqs = {REQUEST.name: 0, ARM.name: 0}
         self._lock = threading.Lock()
 
     def send(self, action: str) -> None:
-        """Publish one request. From any thread."""
+        """Publish one request. From any thread. Raises Unavailable when the page's identity has no right to it."""
         kind = message("GateRequest")
+        channel = ARM if action == "arm" else REQUEST
+        if channel.name not in self._publishers:
+            raise self.wire.refused("publish on", channel)
         with self._lock:
-            self._seq += 1
+            self._seqs[channel.name] += 1
             code = constant("GateRequest", f"ACTION_{action.upper()}")
-            made = kind.make(seq=self._seq, stamp_ns=time.monotonic_ns(), origin=self._origin, action=code)
-            self._publisher.put(kind.pack(made))
+            made = kind.make(seq=self._seqs[channel.name], stamp_ns=time.monotonic_ns(), origin=self._origin, action=code)
+            self._publishers[channel.name].put(kind.pack(made))
 
 
 async def ask(send: Callable[[str], None], gate: Callable[[], tuple[int | None, float]], action: str) -> bool:

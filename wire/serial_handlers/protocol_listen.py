@@ -9,6 +9,7 @@ import select
 import socket
 import struct
 import termios
+from ipaddress import ip_address
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -237,7 +238,16 @@ def _address_of(url: str | None) -> tuple[str, int]:
         raise serial.SerialException(
             f"{url}: expected listen://HOST:PORT with a port from 0 to 65535, as listen://127.0.0.1:7000"
         )
+    if not _is_loopback(parts.hostname):
+        raise serial.SerialException(f"{url}: would listen off this machine, where nothing secures it; use 127.0.0.1")
     return parts.hostname, number
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _listen(host: str, number: int, url: str | None) -> socket.socket:

@@ -1,0 +1,61 @@
+"""The whole rig over TLS: what its processes really declare and say is what the table lets them."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from softloop.offline.run_log import open_run
+from softloop.wire.channels import CHANNELS
+from tests.campaigns.flood import NAME, Site
+from tests.rig import rigs
+
+TRACE = "zenoh::net::routing::interceptor=trace"
+LINE = re.compile(r"(ThreadId\(\d+\)) zenoh::net::routing::interceptor\S*: (.*)")
+
+
+def refused(text):
+    """What the access rules refused, from Zenoh's trace: the line before each refusal, by the thread that wrote it."""
+    last, found = {}, []
+    for line in re.sub(r"\x1b\[[0-9;]*m", "", text).splitlines():
+        match = LINE.search(line)
+        if match is None:
+            continue
+        thread, said = match.groups()
+        if "intercepted" in said:
+            found.append(last.get(thread, "?"))
+        last[thread] = said
+    return found
+
+
+@pytest.fixture(params=["client", "peer"])
+def site(request):
+    made = Site(request.param)
+    yield made
+    made.close()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("pace", ["wall", "lockstep"])
+def test_nothing_that_a_rig_does_is_refused(site, pace, monkeypatch):
+    monkeypatch.setenv("RUST_LOG", TRACE)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[2]))
+    monkeypatch.setattr(rigs, "PROGRAM", (sys.executable, "-m", "tests.security.traced_cli"))
+    with rigs.running(site.text, name=NAME, arguments=("--duration", "3", "--pace", pace)) as rig:
+        assert rig.finish() == 0, rig.output[-2000:] + rig.logs()
+        said = {"launcher": rig.output} | {file.name: file.read_text() for file in rig.run_dir.glob("*.log")}
+        assert "interceptor" in said["launcher"], "Zenoh's trace is not there"
+        assert {name: refused(text) for name, text in said.items() if refused(text)} == {}
+        log = open_run(rig.run_dir)
+        spoken = {c.name for c in CHANNELS if c.logged and c.name not in ("can", "request" if pace == "wall" else "")}
+        assert {name for name in spoken if len(log[name])} == spoken
+        assert {f"{number:x}" for _, number in log.can} == {"80", "90", "100"}
+
+
+def test_the_trace_shows_a_refusal():
+    """Or the test above could not fail."""
+    thread = "2026-01-01T00:00:00Z TRACE rx-0 ThreadId(08) zenoh::net::routing::interceptor"
+    text = f"{thread}::access_control: a is unauthorized to Put (ingress) on b\n{thread}: Msg intercepted!\n"
+    assert refused(text) == ["a is unauthorized to Put (ingress) on b"]
+    assert refused(text.replace("intercepted", "passed")) == []
