@@ -11,13 +11,14 @@ SOURCES := wire dynamics devices plant controller watch offline deploy tests ben
 
 CHROMIUM ?= /usr/bin/chromium
 
-.PHONY: help setup demo test exact test-page test-docs kill mutate fuzz monitor rearm flood lint lock clean
+.PHONY: help setup demo test exact test-page test-docs test-long kill mutate fuzz monitor rearm flood lint lock clean
 
 help:
 	@echo 'make demo   set up, then run the two demonstration trajectories on the simulated rig'
 	@echo 'make test   set up, then all tests'
 	@echo 'make exact  set up, then the three exactness contracts for every law, with both cores kept busy'
 	@echo 'make test-page  the live page in a real browser (Debian: apt install chromium)'
+	@echo 'make test-long  whole rigs on several hosts, over TLS, several at once, under the doctor'
 	@echo 'make test-docs  every command of the documentation, run'
 	@echo 'make docs   the documentation as pages, in docs/_build/html'
 	@echo 'make kill, make mutate, make fuzz, make monitor, make rearm, make flood   the long campaigns, see docs/campaigns.md'
@@ -44,7 +45,7 @@ demo: $(STAMP)
 # Two at a time, by file; those of a whole rig come last and one at a time: they need the machine for themselves.
 test: $(STAMP)
 	$(BIN)/softloop warm
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not rig and not exact and not page and not commands'
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not rig and not exact and not page and not commands and not long'
 	$(BIN)/python -m pytest -m 'rig and not page'
 
 # The live page in Debian's chromium, a whole rig behind it in the last tests; other browsers by CHROMIUM=PATH.
@@ -80,6 +81,11 @@ flood: $(STAMP)
 exact: $(STAMP)
 	$(BIN)/softloop warm
 	$(BIN)/python -m pytest -m exact
+
+# Whole rigs on several hosts, over TLS, several at once, and under the doctor's eyes.
+test-long: $(STAMP)
+	$(BIN)/softloop warm
+	$(BIN)/python -m pytest -m long
 
 # Every command that the documentation shows, run as it stands there, but shorter.
 test-docs: $(STAMP)

@@ -2,9 +2,10 @@
 
     python benchmarks/scale.py [--seconds 20] [--at-most 6] [--cores 0,1] [--json]
 
-One, two, ... rigs run side by side, each with its seven processes on T2. A number of rigs holds 5 ms when every rig stayed armed
-for all of the time, left out no tick, and had its plant in time (a run that is valid evidence). Costs are of the processes of all
-rigs and of the router, while all are armed: CPU time per second, and memory that no other process shares.
+One, two, ... rigs run side by side, each with its seven processes on T2. A rig holds 5 ms when it stayed armed all of the time
+and left out no tick. Its run is valid evidence when, beside other things, its plant was in time too, which is a burden of the
+simulation. Costs are of the processes of all rigs and of the router, while all are armed: CPU time per second, and memory that no
+other process shares.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Row:
     """What a number of rigs did.
 
     Attributes:
-        rigs, held: how many there were, and how many of them held 5 ms.
+        rigs, held, valid: how many there were, how many of them held 5 ms, and how many runs are valid evidence.
         skipped, faults: ticks left out and gate faults, of all.
         late_p99_us, late_max_us: tick lateness of the worst rig. plant_late_ms: of the worst plant.
         cores: CPU seconds per second, of all. mib: unshared memory of all.
@@ -47,6 +48,7 @@ class Row:
 
     rigs: int
     held: int
+    valid: int
     skipped: int
     faults: int
     late_p99_us: float
@@ -179,14 +181,15 @@ def _summary(rigs: Rigs, k: int) -> dict[str, Any]:
 
 
 def _row(summaries: list[dict[str, Any]], cores: float, mib: float, by_process: dict[str, float]) -> Row:
-    held = [s["exit_code"] == 0 and s.get("evidence_valid") and s.get("ticks_skipped") == 0 for s in summaries]
+    held = [s["exit_code"] == 0 and s.get("ticks_skipped") == 0 for s in summaries]
 
     def worst(key: str) -> float:
         return max((float(s[key]) for s in summaries if s.get(key) is not None), default=float("nan"))
 
     return Row(
         len(summaries),
-        sum(map(bool, held)),
+        sum(held),
+        sum(bool(s.get("evidence_valid")) for s in summaries),
         sum(int(s.get("ticks_skipped") or 0) for s in summaries),
         sum(int(s.get("gate_faults") or 0) for s in summaries),
         worst("tick_late_p99_us"),
@@ -216,7 +219,8 @@ def show(rows: list[Row]) -> None:
         table.add_column(head, justify="right")
     for row in rows:
         table.add_row(
-            str(row.rigs), str(row.held), str(row.skipped), str(row.faults), f"{row.late_p99_us:.0f}", f"{row.late_max_us:.0f}",
+            str(row.rigs), str(row.held), str(row.valid), str(row.skipped), str(row.faults),
+            f"{row.late_p99_us:.0f}", f"{row.late_max_us:.0f}",
             f"{row.plant_late_ms:.1f}", f"{row.cores:.2f}", f"{row.cores / row.rigs:.2f}", f"{row.mib / row.rigs:.0f}",
         )  # fmt: skip
     console = Console(width=120)

@@ -248,7 +248,9 @@ class Launch:
 
     def _wait_for_hosts(self) -> Outcome | None:
         """Until nothing is missing on the bench's other hosts; says what is."""
-        end_s, said = time.monotonic() + self.bench.run.hosts_wait_s, ""
+        run = self.bench.run
+        limit_s = run.hosts_wait_s + (0.0 if self.fleet.leads else run.host_silence_s)  # the host that leads is to say it first
+        end_s, said = time.monotonic() + limit_s, ""
         while True:
             missing = ", ".join(self.fleet.missing())
             if not missing:
@@ -262,7 +264,7 @@ class Launch:
             if trouble is not None:
                 return trouble
             if time.monotonic() >= end_s:
-                return Outcome(EXIT_LOST, f"not there after {self.bench.run.hosts_wait_s:g} s: {missing}")
+                return Outcome(EXIT_LOST, f"not there after {limit_s:g} s: {missing}")
             self.stop.wait(POLL_S)
 
     def _keep_listeners(self) -> None:

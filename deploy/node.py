@@ -73,8 +73,8 @@ def run_node(name: str, bench_file: Path, run_dir: Path, lifeline_fd: int | None
         SoftloopError: the bench file is wrong, or has no such process.
     """
     bench = load_bench(bench_file, run_dir)
-    bench = on_host(bench, host_of(bench, name))
     process = find_process(bench, name)
+    bench = on_host(bench, host_of(bench, name))
 
     def body(context: Context) -> None:
         _inject(bench, process, context)

@@ -4,7 +4,7 @@ import pytest
 
 from tests.campaigns.flood import WHO, campaign
 
-pytestmark = pytest.mark.rig
+pytestmark = pytest.mark.long
 
 
 def test_a_rig_beside_attackers_stays_armed_and_hears_nothing_of_them():

@@ -60,6 +60,8 @@ port = "/dev/null"
         (("run", "nowhere.toml"), EXIT_USAGE, "nowhere.toml: there is no such bench file"),
         (("check", "nowhere.toml"), EXIT_USAGE, "nowhere.toml: there is no such bench file"),
         (("node", "driver", "sim", "--run-dir", "/tmp"), EXIT_USAGE, "bench 'sim' has no process 'driver'; it has: recorder, "),
+        (("run", "sim", "--host", "desk"), EXIT_USAGE, "bench 'sim' has no host 'desk'; it has: none, it runs on one"),
+        (("router", "sim", "--with", "zenohd2"), EXIT_USAGE, "'zenohd2'"),
         (("request", "sim", "fly"), EXIT_USAGE, "'fly'"),
         (("report", "/no/such/run"), EXIT_USAGE, "/no/such/run"),
     ],

@@ -17,6 +17,8 @@ from softloop.deploy.run_dir import bench_lock, keep_certificate
 from softloop.devices.protocols.can_frames import STATE_WATCHDOG
 from softloop.wire.mcap_layout import attachments_of
 
+pytestmark = pytest.mark.long
+
 # A busy machine's stalls are not what these tests are about.
 WIDE = "[host]\nrealtime_priority = 0\n[valves]\nage_ticks = 20\nhold_ticks = 20\n"
 NEVER_OVER_S = 240

@@ -17,8 +17,6 @@ from softloop.wire.session import open_wire
 from tests.rig.fleets import CLI, HOSTS, bench_text, fleet, own_clocks_permitted
 from tests.rig.test_whole_rig import SHORT, WIDE, short_csv
 
-pytestmark = pytest.mark.rig
-
 SIM = shipped_benches()["sim"]
 AHEAD_S = {"desk": 0, "devices": 1000, "log": 77, "rig": -400}
 GATE_FAULT, GATE_ARMED = constant("ValveStatus", "GATE_FAULT"), constant("ValveStatus", "GATE_ARMED")
@@ -38,6 +36,7 @@ def assert_clean(rigs):
     assert list(rigs.folder.glob("*.sock*")) == []
 
 
+@pytest.mark.rig
 @pytest.mark.skipif(not own_clocks_permitted(), reason="needs the right to make a time namespace (root)")
 def test_four_hosts_with_clocks_of_their_own_track_as_one(tmp_path):
     with fleet(text_of(tmp_path, "clocks", mode="peer")) as rigs:
@@ -94,6 +93,7 @@ def gate_of(bench, wanted, patience_s=20.0):
     return False
 
 
+@pytest.mark.long
 def test_a_killed_router_comes_back_within_two_seconds_and_no_process_is_restarted(tmp_path):
     text = text_of(tmp_path, "router", mode="client", shared_router=True)
     with fleet(text.replace("approach_s = 2.0", "approach_s = 3.0")) as rigs:
@@ -142,6 +142,7 @@ def kill_launcher(rigs, host):
     rigs.hosts[host].family()["launcher"].kill()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("host", "kill"), [("devices", kill_all), ("devices", kill_launcher), ("desk", kill_launcher)])
 def test_a_lost_host_ends_in_a_vent_and_all_others_end(tmp_path, host, kill):
     with fleet(text_of(tmp_path, "lost", mode="peer")) as rigs:
@@ -157,6 +158,7 @@ def test_a_lost_host_ends_in_a_vent_and_all_others_end(tmp_path, host, kill):
         assert truth["chamber_pressure_kpa"][-1] < 0.5 * truth["chamber_pressure_kpa"].max()
 
 
+@pytest.mark.long
 def test_lockstep_over_four_hosts_is_the_same_as_in_one_process(tmp_path):
     more = '[pace]\nmode = "lockstep"\n[run]\nduration_s = 1.5\nvent_timeout_s = 0.3\nsettle_s = 0.3\n'
     text = bench_text("step", mode="peer", base=None)

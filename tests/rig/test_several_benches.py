@@ -1,9 +1,10 @@
-"""Two whole rigs at once on one machine and one router: neither knows of the other."""
+"""Two benches at once on one machine and one router: neither knows of the other."""
 
 import os
 import signal
 import subprocess
 import sys
+import time
 from contextlib import ExitStack, contextmanager
 
 import pytest
@@ -13,12 +14,12 @@ from softloop.deploy.bench import load_bench, shipped_benches
 from softloop.deploy.same import differences_from_batch, trace_of
 from softloop.offline.log import open_log
 from softloop.wire.channels import ROOT
+from softloop.wire.errors import EXIT_ENVIRONMENT
 from tests.rig.lockstep_benches import eventful
-from tests.rig.rigs import running
-from tests.rig.test_whole_rig import ARMED, WIDE
+from tests.rig.rigs import LIMIT_S, running
 from tests.wire.rendezvous import short_folder
 
-pytestmark = pytest.mark.rig
+pytestmark = pytest.mark.long
 
 SIM = shipped_benches()["sim"]
 NAMES = ("east", "west")
@@ -74,35 +75,60 @@ def test_each_of_two_rigs_leaves_what_it_leaves_alone_byte_for_byte():
             assert rig.left_over() == []
 
 
-def test_a_stop_of_one_rig_leaves_the_other_armed():
-    with one_router() as (folder, table), ExitStack() as stack:
-        rigs = both(stack, lambda name: f'base = "{SIM}"\n{WIDE}[run]\nduration_s = 60.0\nreport = false\n', folder, table)
-        for rig in rigs.values():
-            rig.wait_for_word(ARMED)
-        command = [sys.executable, "-m", "softloop.deploy.cli", "request", str(rigs["east"].bench), "stop", "--timeout", "20"]
-        environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder)}
-        asked = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=environment)
-        assert asked.returncode == 0, asked.stdout + asked.stderr
-        assert rigs["east"].finish() == 1
-        assert "emergency stop" in rigs["east"].output
-        assert rigs["west"].process.poll() is None
-        rigs["west"].signal(signal.SIGINT)
-        assert rigs["west"].finish() == 130
-        assert "FAULT" not in rigs["west"].output, rigs["west"].output
-        assert [rig.left_over() for rig in rigs.values()] == [[], []]
+class Gates:
+    """The gate of each of two benches on one router, alone, as `softloop node` runs it."""
+
+    def __init__(self, folder, table, stack):
+        self.folder, self.environment = folder, {**os.environ, "XDG_RUNTIME_DIR": str(folder)}
+        for name in NAMES:
+            (folder / name).mkdir()
+            text = AT_REST.format(name=name, table=table)
+            (folder / f"{name}.toml").write_text(text)
+            arguments = ["node", "valves", str(folder / f"{name}.toml"), "--run-dir", str(folder / name)]
+            process = stack.enter_context(
+                subprocess.Popen([*PROGRAM, *arguments], env=self.environment, stderr=subprocess.DEVNULL)
+            )
+            stack.callback(process.kill)
+
+    def softloop(self, *arguments):
+        return subprocess.run(
+            [*PROGRAM, *arguments], capture_output=True, text=True, timeout=LIMIT_S, check=False, env=self.environment
+        )
+
+    def ask(self, name, action):
+        """`softloop request`, again while the gate is not heard yet; what it says."""
+        end_s = time.monotonic() + LIMIT_S
+        while True:
+            asked = self.softloop("request", str(self.folder / f"{name}.toml"), action, "--timeout", "30")
+            if asked.returncode != EXIT_ENVIRONMENT:
+                assert asked.returncode == 0, asked.stdout + asked.stderr
+                return asked.stdout.strip()
+            assert time.monotonic() < end_s, asked.stderr
 
 
-def test_the_same_bench_twice_is_refused_and_the_first_one_does_not_notice():
+PROGRAM = (sys.executable, "-m", "softloop.deploy.cli")
+AT_REST = (
+    'name = "{name}"\n{table}[host]\nrealtime_priority = 0\n[run]\nshared_router = true\n'
+    '[can.can0]\n[valves]\n[pressures]\n[inclinometer]\nport = "/dev/null"\n'
+)
+
+
+@pytest.fixture
+def gates():
     with one_router() as (folder, table), ExitStack() as stack:
-        text = f'base = "{SIM}"\n{WIDE}[run]\nshared_router = true\nduration_s = 60.0\nreport = false\n{table}'
-        first = stack.enter_context(running(text, name="east", runtime=folder))
-        first.wait_for_word(ARMED)
-        second = stack.enter_context(running(text, name="east", runtime=folder))
-        assert second.finish() == 3
-        with short_folder() as elsewhere:  # another user's lock folder: the router knows the bench's processes all the same
-            third = stack.enter_context(running(text, name="east", runtime=elsewhere))
-            assert third.finish() == 3
-            assert "is running already" in third.output
-        first.signal(signal.SIGINT)
-        assert first.finish() == 130
-        assert "FAULT" not in first.output, first.output
+        yield Gates(folder, table, stack)
+
+
+def test_a_stop_of_one_rig_does_not_reach_the_other(gates):
+    assert {gates.ask(name, "disarm") for name in NAMES} == {"gate disarmed"}
+    assert gates.ask("east", "stop") == "gate fault (emergency stop)"
+    assert gates.ask("west", "disarm") == "gate disarmed"  # it is where it was, and hears what is meant for it
+    assert gates.ask("west", "stop") == "gate fault (emergency stop)"
+
+
+def test_the_router_knows_a_bench_that_runs_already(gates):
+    assert {gates.ask(name, "disarm") for name in NAMES} == {"gate disarmed"}
+    refused = gates.softloop("run", str(gates.folder / "east.toml"), "--run-dir", str(gates.folder / "again"))
+    assert refused.returncode == EXIT_ENVIRONMENT
+    assert "bench 'east' is running already at " in refused.stderr
+    assert gates.ask("east", "disarm") == "gate disarmed"

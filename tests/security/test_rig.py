@@ -11,7 +11,6 @@ from softloop.wire.channels import CHANNELS
 from tests.campaigns.flood import NAME, Site
 from tests.rig import rigs
 
-pytestmark = pytest.mark.rig
 TRACE = "zenoh::net::routing::interceptor=trace"
 LINE = re.compile(r"(ThreadId\(\d+\)) zenoh::net::routing::interceptor\S*: (.*)")
 
@@ -37,6 +36,7 @@ def site(request):
     made.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pace", ["wall", "lockstep"])
 def test_nothing_that_a_rig_does_is_refused(site, pace, monkeypatch):
     monkeypatch.setenv("RUST_LOG", TRACE)
