@@ -28,8 +28,10 @@ def refused(text):
         if match is None:
             continue
         thread, said = match.groups()
-        if "intercepted" in said and not UNASKED.search(last.get(thread, "")):
-            found.append(last.get(thread, "?"))
+        # A refusal whose reason is not there, for lines of two threads that ran into each other, is left out: a right that is
+        # missing is refused on more than one link.
+        if "intercepted" in said and thread in last and not UNASKED.search(last[thread]):
+            found.append(last[thread])
         last[thread] = said
     return found
 
