@@ -19,12 +19,13 @@ def doctor(
     certificate: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the outcome here too; `[run] certificate` puts it into each log.")
     ] = None,
+    host: Annotated[str | None, typer.Option(metavar="NAME", help="Of a bench on several hosts: which of them this is.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
 ) -> int:
     """Accept the computer and the devices before the rig runs: permissions, lateness, Zenoh, CAN, inclinometer, disk."""
     from softloop.deploy.doctor import doctor as examine
 
-    return examine(bench, seconds, certificate, as_json=as_json)
+    return examine(bench, seconds, certificate, host, as_json=as_json)
 
 
 @app.command("doctor-ticks", hidden=True)
@@ -60,6 +61,7 @@ def install(
     program: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The command softloop. Default: that of this installation.")
     ] = None,
+    host: Annotated[str, typer.Option(metavar="NAME", help="Of benches on several hosts: which of them this is.")] = "",
     network: Annotated[bool, typer.Option("--network", help="Allow addresses off this machine.")] = False,
 ) -> int:
     """Write systemd units: a run of a bench, its router, its viewers, each a template by bench."""
@@ -67,4 +69,4 @@ def install(
     from softloop.deploy.install import own_program
     from softloop.deploy.services import Setting
 
-    return write_units(to, Setting(program or own_program(), user, benches, cpus, network))
+    return write_units(to, Setting(program or own_program(), user, benches, cpus, network, host))

@@ -1,12 +1,21 @@
-"""What the doctor says of the computer's clocks: what counts the rig's time, and whether the time of day is kept right."""
+"""What the doctor says of clocks: what counts the rig's time, the time of day, and how far another host's clock is away."""
 
 from __future__ import annotations
 
 import ctypes
+import statistics
+import time
 from pathlib import Path
 from typing import Any
 
-from softloop.deploy.doctor_check import Check
+from softloop.deploy.bench import Bench
+from softloop.deploy.doctor_check import Check, Verdict
+from softloop.deploy.hosts import launcher_name, leader, number_of, on_host
+from softloop.wire.clock_config import ClockConfig
+from softloop.wire.clock_offset import Exchange
+from softloop.wire.errors import SoftloopError
+from softloop.wire.host_clock import Follower, TimeQuestion
+from softloop.wire.session import open_wire
 
 SOURCE_FILE = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
 SLOW_SOURCES = ("hpet", "acpi_pm", "jiffies", "refined-jiffies")  # a look at these costs microseconds, or they step
@@ -51,3 +60,55 @@ def clock(source: str, error_ms: float | None) -> Check:
         do = "let chrony or systemd-timesyncd keep it; logs bear its time, and nothing else depends on it"
         return Check("clock", "warn", found, do, measured)
     return Check("clock", "pass", found, "", measured)
+
+
+def offset(bench: Bench, host: str, seconds: float) -> Check:
+    """How far this host's clock is from that of the host which leads, asked of its launcher as a run does."""
+    if host == leader(bench):
+        return Check("clock offset", "pass", "this host keeps the rig clock")
+    try:
+        exchanges = exchanged(bench, host, seconds)
+    except SoftloopError as error:
+        return _unknown(bench, str(error))
+    return judge_offset(bench.clock, exchanges, number_of(bench, host)) if exchanges else _unknown(bench, "nobody answers")
+
+
+def _unknown(bench: Bench, why: str) -> Check:
+    first = f"softloop run --host {leader(bench)}"
+    return Check("clock offset", "warn", why, f"start `{first}` there, which waits for the others, and ask again here")
+
+
+def exchanged(bench: Bench, host: str, seconds: float) -> list[Exchange]:
+    """Questions for the time, each `[clock] period_ms`, and their answers. Raises Unavailable when there is no way to ask."""
+    found: list[Exchange] = []
+    with open_wire(on_host(bench, host).zenoh, bench.name, launcher_name(bench, host)) as wire:  # who has the right to ask
+        wire.settle(lambda: False)
+        question, end_s = TimeQuestion(wire), time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            exchange = question.ask()
+            found += [exchange] if exchange is not None else []
+            time.sleep(bench.clock.period_ms * 1e-3)
+    return found
+
+
+def judge_offset(config: ClockConfig, exchanges: list[Exchange], number: int) -> Check:
+    """The offset at the last exchange, as sure as `[clock]` asks for, and clocks that do not run apart faster than it allows."""
+    follower = Follower(config, number)
+    for exchange in exchanges:
+        follower.learn(exchange)
+    end_ns = exchanges[-1].answered_ns
+    known, unsure_ms = follower.estimator.at(end_ns), follower.uncertainty_ns(end_ns) * 1e-6
+    trip_us = statistics.median(exchange.delay_ns for exchange in exchanges) * 1e-3
+    drifts = abs(known.drift_ppm) - known.drift_error_ppm > config.drift_max_ppm
+    verdict: Verdict = "fail" if unsure_ms > config.uncertainty_max_ms or drifts or follower.estimator.steps else "pass"
+    found = (
+        f"{known.offset_ns * 1e-6:.3f} ms, known to {unsure_ms:.3f} ms (allowed {config.uncertainty_max_ms:g}); drift "
+        f"{known.drift_ppm:.1f} ppm, known to {known.drift_error_ppm:.1f}; steps {follower.estimator.steps}; "
+        f"round trip {trip_us:.0f} us, {len(exchanges)} of them"
+    )
+    do = "a quieter network between the hosts; a clock that steps or drifts is one that a program sets: it must not"
+    measured = {
+        "offset_ms": known.offset_ns * 1e-6, "uncertainty_ms": unsure_ms, "drift_ppm": known.drift_ppm,
+        "drift_error_ppm": known.drift_error_ppm, "steps": follower.estimator.steps, "round_trip_us": trip_us,
+    }  # fmt: skip
+    return Check("clock offset", verdict, found, "" if verdict == "pass" else do, measured)

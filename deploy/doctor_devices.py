@@ -6,16 +6,16 @@ A bench with `[plant]` has its simulated rig started for it, with nobody who com
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from softloop.deploy.bench import Bench
+from softloop.deploy.bench import PROCESS_NAMES, Bench
 from softloop.deploy.children import Child, Children
 from softloop.deploy.doctor_can import can_checks
 from softloop.deploy.doctor_check import Check
-from softloop.deploy.doctor_inclinometer import inclinometer
+from softloop.deploy.doctor_inclinometer import NAME, inclinometer
 from softloop.deploy.router import remove_sockets
 from softloop.deploy.run_dir import BENCH_FILE
 from softloop.wire.clock import Clock, WallClock
@@ -43,41 +43,56 @@ def inclinometer_is_simulated(bench: Bench) -> bool:
     return bench.plant is not None and bench.inclinometer is not None and same_wire(bench.plant.serial, bench.inclinometer.port)
 
 
-def is_real(bench: Bench) -> bool:
-    """Whether any device of the bench is a real one."""
-    buses = any(not bus_is_simulated(bench, name) for name in buses_of(bench))
-    return buses or (bench.inclinometer is not None and not inclinometer_is_simulated(bench))
+def is_real(bench: Bench, own: Collection[str] = PROCESS_NAMES) -> bool:
+    """Whether any device of the processes `own` is a real one."""
+    buses = any(not bus_is_simulated(bench, name) for name in buses_of(bench, own))
+    return buses or (has(bench, own, NAME) and not inclinometer_is_simulated(bench))
 
 
-def buses_of(bench: Bench) -> list[str]:
-    """The buses that a device process uses."""
-    return sorted({table.can for table in (bench.valves, bench.pressures) if table is not None})
+def has(bench: Bench, own: Collection[str], process: str) -> bool:
+    """Whether a process is in the bench, and among `own`: those of the host that is looked at."""
+    return process in own and getattr(bench, process) is not None
 
 
-def devices(bench: Bench, run_dir: Path, wire: Wire, seconds: float, clock: Clock | None = None) -> list[Check]:
+def buses_of(bench: Bench, own: Collection[str] = PROCESS_NAMES) -> list[str]:
+    """The buses that a device process of `own` uses."""
+    return sorted({getattr(bench, process).can for process in ("valves", "pressures") if has(bench, own, process)})
+
+
+def devices(
+    bench: Bench, run_dir: Path, wire: Wire, seconds: float, own: Collection[str] = PROCESS_NAMES, clock: Clock | None = None
+) -> list[Check]:
     """The checks of each bus that a device process uses, and of the inclinometer, for `seconds` each.
 
     Args:
         run_dir: a folder in which the bench file of this look stands; the simulated rig lives in it.
+        own: the processes of the host that is looked at.
     """
-    if bench.plant is None:
-        return listen_to_all(bench, wire, seconds, clock or WallClock())
+    clock = clock or WallClock()
+    if not has(bench, own, PLANT):
+        return listen_to_all(bench, wire, seconds, own, clock)
     with simulated_rig(bench, run_dir, wire) as trouble:
         if trouble:
             return [Check("simulated rig", "fail", trouble, "see that `softloop check` says good")]
-        return listen_to_all(bench, wire, seconds, clock or WallClock())
+        return listen_to_all(bench, wire, seconds, own, clock)
 
 
-def listen_to_all(bench: Bench, wire: Wire, seconds: float, clock: Clock) -> list[Check]:
+def listen_to_all(bench: Bench, wire: Wire, seconds: float, own: Collection[str], clock: Clock) -> list[Check]:
     """As `devices`, of a rig that is there."""
-    checks = []
-    for name in buses_of(bench):
-        heard = can_checks(bench, name, wire, clock, seconds)
-        checks += [_marked(check) for check in heard] if bus_is_simulated(bench, name) else heard
-    if bench.inclinometer is not None:
-        check = inclinometer(bench, clock, seconds)
-        checks.append(_marked(check) if inclinometer_is_simulated(bench) else check)
+    checks, here = [], has(bench, own, PLANT)
+    for name in buses_of(bench, own):
+        simulated = bus_is_simulated(bench, name)
+        heard = can_checks(bench, name, wire, clock, seconds) if here or not simulated else [_elsewhere(f"CAN {name}")]
+        checks += [_marked(check) for check in heard] if simulated else heard
+    if has(bench, own, NAME):
+        simulated = inclinometer_is_simulated(bench)
+        check = inclinometer(bench, clock, seconds) if here or not simulated else _elsewhere(NAME)
+        checks.append(_marked(check) if simulated else check)
     return checks
+
+
+def _elsewhere(name: str) -> Check:
+    return Check(name, "pass", "on another host, and not looked at from here")
 
 
 def _marked(check: Check) -> Check:

@@ -153,10 +153,10 @@ def log_bytes_s() -> float:
     return sum((message(c.message).size + RECORD_BYTES) * c.rate_hz for c in CHANNELS if c.logged)
 
 
-def disk(bench: Bench, folder: Path) -> list[Check]:
-    """Writes that are made safe one by one, and room for the log, where the runs of this bench go."""
-    if bench.recorder is None:
-        return [Check("disk", "pass", "no recorder on this bench")]
+def disk(bench: Bench, folder: Path, *, recorded: bool = True) -> list[Check]:
+    """Writes that are made safe one by one, and room for the log, where the runs of this bench go, if it is `recorded` here."""
+    if bench.recorder is None or not recorded:
+        return [Check("disk", "pass", "no recorder on this bench" if recorded else "the recorder is on another host")]
     try:
         stalls_s = sorted(write_stalls(folder))
         free = shutil.disk_usage(folder).free

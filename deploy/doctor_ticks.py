@@ -18,6 +18,7 @@ from softloop.deploy.bench import Bench
 from softloop.wire.clock import Deadlines, WallClock
 from softloop.wire.errors import SoftloopError
 from softloop.wire.messages import message
+from softloop.wire.rights import DOCTOR_ROOT
 from softloop.wire.schedule import PERIOD_NS
 from softloop.wire.session import Inbox, Wire, open_wire
 from softloop.wire.shell import prefer_realtime
@@ -110,4 +111,4 @@ def _trip(publisher: Any, inbox: Inbox, number: int) -> int | None:
 
 def _key(bench: Bench, end: str) -> str:
     """Outside the bench's own keys: no recorder and no page hears it."""
-    return f"softloop-doctor/{bench.name}/{end}"
+    return f"{DOCTOR_ROOT}/{bench.name}/{end}"

@@ -43,6 +43,8 @@ def _check(setting: Setting) -> None:
         raise BadConfig("--program and --benches: give the whole paths, from / on")
     if not setting.program.is_file():
         raise BadConfig(f"--program {setting.program}: there is no such file")
+    if not all(sign in "abcdefghijklmnopqrstuvwxyz0123456789_-" for sign in setting.host):
+        raise BadConfig(f"--host {setting.host!r}: a name is a-z, 0-9, _ and -")
     if not all(sign in "0123456789-, " for sign in setting.cpus):
         raise BadConfig(f"--cpus {setting.cpus!r}: cores by number, such as 2-3 or 2,3")
 

@@ -25,6 +25,7 @@ class Setting:
     Attributes:
         program: the command `softloop`. user: who runs it, and its group. benches: the folder of bench files.
         cpus: cores of the rig, as systemd's CPUAffinity; empty: all. network: whether off loopback is allowed.
+        host: of benches on several hosts, which this is.
     """
 
     program: Path
@@ -32,6 +33,7 @@ class Setting:
     benches: Path = Path("/etc/softloop")
     cpus: str = ""
     network: bool = False
+    host: str = ""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ def _run(setting: Setting) -> Unit:
     """The launcher and with it the control path: it ends when it ends. No [Install]: a machine that boots moves nothing."""
     service = (
         "Type=exec",
-        f"ExecStart={setting.program} run --quiet {setting.benches}/%i.toml",
+        f"ExecStart={setting.program} run --quiet {_host(setting)}{setting.benches}/%i.toml",
         "# The control path never starts again by itself, see docs/safety.md; the launcher brings back what only listens.",
         "Restart=no",
         "# SIGTERM to the launcher alone, which vents and then ends the others in order; to all of them when it is gone.",
@@ -82,6 +84,10 @@ def _run(setting: Setting) -> Unit:
     )
     head = ("Description=softloop bench %i", "After=network.target softloop-router@%i.service")
     return Unit("softloop", {"Unit": head, "Service": service})
+
+
+def _host(setting: Setting) -> str:
+    return f"--host {setting.host} " if setting.host else ""
 
 
 def _service(setting: Setting, name: str, what: str, command: str, restart: Lines) -> Unit:

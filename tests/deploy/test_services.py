@@ -67,6 +67,12 @@ def test_the_run_gets_what_the_5_ms_path_asks_for():
     assert not {"MemoryDenyWriteExecute", "RestrictRealtime"} & set(service)
 
 
+def test_one_of_several_hosts_runs_its_own_share():
+    (started,) = by_name(host="board")["softloop"]["Service"]["ExecStart"]
+    assert started.split()[1:] == ["run", "--quiet", "--host", "board", "/etc/softloop/%i.toml"]
+    assert "--host" not in by_name(host="board")["softloop-router"]["Service"]["ExecStart"][0]
+
+
 def test_a_stop_reaches_the_launcher_first_and_waits_for_it():
     service = by_name()["softloop"]["Service"]
     assert service["ExecStop"] == ["-/bin/kill -TERM $MAINPID", "-/usr/bin/tail --pid=${MAINPID} -f /dev/null"]
@@ -135,6 +141,7 @@ def test_systemd_would_find_something_wrong(tmp_path):
         (("--to", ".", "--user", ""), 2, "cannot stand in a unit"),
         (("--to", ".", "--benches", "/etc/$HOME"), 2, "cannot stand in a unit"),
         (("--to", ".", "--cpus", "all"), 2, "cores by number"),
+        (("--to", ".", "--host", "a b"), 2, "a name is a-z"),
     ],
 )
 def test_a_mistake_is_one_line_and_writes_nothing(arguments, code, said, tmp_path, monkeypatch):
