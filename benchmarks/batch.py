@@ -25,7 +25,7 @@ from logged_currents import Currents
 from plant_speed import loop as run_plant_alone
 from scipy_loop import scipy_loop
 
-from softloop.controller.records import LAWS as ALL_LAWS
+from softloop.controller.records import ANGLE_LAWS
 from softloop.deploy.batch import rig_tables
 from softloop.deploy.bench import find_bench, load_bench
 from softloop.offline.campaign import Case, controller_for, plan_cases, run_cases
@@ -37,7 +37,7 @@ from softloop.plant.setup import new_device, new_state, plant_record
 from softloop.wire.schedule import PERIOD_NS, START_NS, make_schedule
 
 TRAJECTORIES, REPEATS = ("t1", "t2"), 7
-LAWS = tuple(law for law in ALL_LAWS if law != "pressure")  # a campaign judges angles
+LAWS = ANGLE_LAWS  # a campaign judges angles
 SCIPY_S, SCIPY_METHODS = 2.0, ("RK45", "LSODA")
 JOBS_SEEDS = 60
 PERIOD_S = 1e-9 * PERIOD_NS

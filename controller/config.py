@@ -90,25 +90,47 @@ class ObserverConfig(Table):
     line_ms: float = Field(3.0, ge=0, le=50, description="the chamber's pressure trails the sensor's by this")
     play_ma: float = Field(8.0, ge=0, le=30, description="half the width of the valves' hysteresis that is undone")
     play_still_ma: float = Field(0.5, ge=0, description="a smaller change of the wanted current does not turn the play round")
+    teach_kpa: float = Field(
+        0.0,
+        ge=0,
+        le=100,
+        description="below this pressure, where little flows, the exhaust valve's offset is learned as slowly as at it",
+    )
+    growth_1_deg: float = Field(0.0, ge=0, le=0.02, description="part by which the chamber's volume grows per degree of bending")
     whiteness: float = Field(0.0, ge=0, le=1, description="trust gate: autocorrelation of the innovation that shuts it; 0: none")
 
 
 class PressureConfig(Table):
-    """`[controller.pressure]`: step 2 alone."""
+    """`[controller.pressure]`: step 2 alone, in both laws that track a pressure."""
 
     k2: float = Field(30.0, gt=0, description="K_2, 1/s")
     epsilon2: float = Field(1.0e3, gt=0, description="kPa^2/s, Eq. 47")
     delta2: float = Field(60.0, ge=0, description="bound of Delta_2, kPa/s")
 
 
+class ValveTestConfig(Table):
+    """`[controller.valve_test]`: flow tests of the valves; for each current a test of both, with a full and an empty tank."""
+
+    first_ma: float = Field(70.0, gt=0, description="lowest current")
+    last_ma: float = Field(170.0, gt=0, description="highest current; it also fills and empties between tests")
+    levels: int = Field(8, ge=2, le=50, description="how many currents, evenly from the lowest to the highest")
+    test_s: float = Field(6.0, gt=0, le=60, description="length of one test")
+    fill_s: float = Field(5.0, ge=0, le=60, description="at the highest current, before an exhaust test")
+    empty_s: float = Field(9.0, ge=0, le=60, description="likewise before the next charge test")
+    rest_s: float = Field(1.0, gt=0, le=60, description="both valves shut, between any two")
+    top_kpa: float = Field(160.0, gt=0, description="the charge valve is shut at this chamber pressure")
+    low_kpa: float = Field(2.0, gt=0, description="the exhaust valve at this one")
+
+
 class ControllerConfig(ProcessTable):
     """`[controller]`: the law, its trajectory, and what it is told of delays and budgets."""
 
-    law: Literal["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure"] = Field(
-        "arc", description="C1, C1 with our observer, C2, C3, ours, or step 2 of C3 alone; each has its table below"
+    law: Literal["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure", "pressure_eso", "valve_test"] = Field(
+        "arc",
+        description="C1, C1 with our observer, C2, C3, ours; step 2 of C3 alone, also with our observer; currents as planned",
     )
     parameters: str = Field("table1", description="a shipped parameter set, or the path of a parameter file")
-    trajectory: str = Field("t1", description="t1, t2, excitation_1hz, excitation_05hz, or the path of a CSV file t_s, value")
+    trajectory: str = Field("t1", description="t1, t2, excitation_1hz, excitation_05hz, valve_steps, or a CSV file's path")
     trajectory_seed: int = Field(1, ge=0, le=2**32 - 1, description="phases of the multi-sines")
     approach_s: float = Field(4.0, gt=0, le=60, description="length of the smooth move to the first point")
     rest_deg_s: float = Field(
@@ -127,3 +149,4 @@ class ControllerConfig(ProcessTable):
     arc_eso: ArcEsoConfig = ArcEsoConfig()
     observer: ObserverConfig = ObserverConfig()
     pressure: PressureConfig = PressureConfig()
+    valve_test: ValveTestConfig = ValveTestConfig()

@@ -84,9 +84,15 @@ def valve_open(model: Any, supply_kpa: float, state: Any) -> bool:
     return False
 
 
-@kernel(types.void(MODEL_TYPE, STATE_TYPE, _F8, _F8, _F8, _F8))
-def teach_valve(model: Any, state: Any, settled_s: float, period_s: float, supply_kpa: float, flow_kpa_s: float) -> None:
-    """Give a missing flow to the valve that was open when it arose, where only one can have been."""
+@kernel(types.void(MODEL_TYPE, OBSERVER_GAINS_TYPE, STATE_TYPE, _F8, _F8, _F8, _F8))
+def teach_valve(
+    model: Any, gains: Any, state: Any, settled_s: float, period_s: float, supply_kpa: float, flow_kpa_s: float
+) -> None:
+    """Give a missing flow to the valve that was open when it arose, where only one can have been.
+
+    Near the room's pressure a small missing flow would be a large offset, and a wrong one once the pressure is up again:
+    there the exhaust valve learns as at `gains.teach_kpa`.
+    """
     observer, theta = state.observer, state.theta
     if state.mode_ticks * period_s < settled_s:
         return
@@ -97,7 +103,7 @@ def teach_valve(model: Any, state: Any, settled_s: float, period_s: float, suppl
         step = flow_kpa_s / (theta[KV1_CHARGE] * max(f1, _FLOW_FLOOR))
         observer.charge_offset_ma = within(observer.charge_offset_ma - step, _OFFSET_MAX_MA)
     else:
-        f1, _, _ = known_terms(model, False, supply_kpa, observer.chamber_kpa)
+        f1, _, _ = known_terms(model, False, supply_kpa, max(observer.chamber_kpa, gains.teach_kpa))
         step = flow_kpa_s / (theta[KV1_EXHAUST] * min(f1, -_FLOW_FLOOR))
         observer.exhaust_offset_ma = within(observer.exhaust_offset_ma - step, _OFFSET_MAX_MA)
 
@@ -115,7 +121,7 @@ def observe_pressure(config: Any, model: Any, gains: Any, inputs: Any, state: An
     if np.isfinite(error):
         near, cause = double_pole(gains.pressure_1_s, seconds)
         observer.chamber_kpa += near * error
-        teach_valve(model, state, seconds - end, period, inputs.pressure.supply_pressure_kpa, cause * error)
+        teach_valve(model, gains, state, seconds - end, period, inputs.pressure.supply_pressure_kpa, cause * error)
 
 
 @kernel(types.void(OBSERVER_TYPE, _F8))

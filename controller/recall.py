@@ -29,8 +29,7 @@ from softloop.controller.records import (
     PHASE_TRACK,
     STATE_TYPE,
 )
-from softloop.controller.references import reference_at
-from softloop.controller.tick import SCRATCH_TYPE, move_between
+from softloop.controller.tick import SCRATCH_TYPE, plan_approach
 from softloop.wire.kernel import array_of, kernel
 
 _F8 = types.f8
@@ -47,8 +46,7 @@ def recall_course(config: Any, knots: np.ndarray, table: np.ndarray, cycle: Any,
         state.approach[i] = 0.0
     state.approach[0] = cycle.internal[IN_APPROACH_START]
     if cycle.phase == PHASE_APPROACH:
-        reference_at(config.plan_kind, knots, table, 0.0, scratch.end)
-        move_between(state.approach[0], scratch.end, 1e-9 * config.approach_ns, state.approach)
+        plan_approach(config, knots, table, state.approach[0], state, scratch)
 
 
 @kernel(types.void(CYCLE_TYPE, OBSERVER_TYPE))

@@ -17,7 +17,8 @@ GATE_ARMED = constant("ValveStatus", "GATE_ARMED")
 OUTPUT_PASS = constant("ValveStatus", "OUTPUT_PASS")
 SAMPLE_OK = constant("PressureSample", "STATUS_OK")
 
-LAW_PID, LAW_ARC, LAW_PRESSURE, LAW_SMC, LAW_ARC_ESO, LAW_PID_ESO = 0, 1, 2, 3, 4, 5
+LAW_PID, LAW_ARC, LAW_PRESSURE, LAW_SMC, LAW_ARC_ESO, LAW_PID_ESO, LAW_PRESSURE_ESO = 0, 1, 2, 3, 4, 5, 6
+LAW_VALVE_TEST = 7
 LAWS = {
     "pid": LAW_PID,
     "pid_eso": LAW_PID_ESO,
@@ -25,8 +26,13 @@ LAWS = {
     "arc": LAW_ARC,
     "arc_eso": LAW_ARC_ESO,
     "pressure": LAW_PRESSURE,
+    "pressure_eso": LAW_PRESSURE_ESO,
+    "valve_test": LAW_VALVE_TEST,
 }
-OBSERVED_LAWS = ("arc_eso", "pid_eso")  # these are given the observer's state, the others the newest samples carried on
+ANGLE_LAWS = ("pid", "pid_eso", "smc", "arc", "arc_eso")
+PRESSURE_LAWS = ("pressure", "pressure_eso")  # their trajectory is a pressure
+# These are given the observer's state, the others the newest samples carried on.
+OBSERVED_LAWS = ("arc_eso", "pid_eso", "pressure_eso")
 MODES_TABLE_2, MODES_FLOW_DEMAND, MODES_LATCHED = 0, 1, 2
 MODE_RULES = {"table2": MODES_TABLE_2, "flow": MODES_FLOW_DEMAND, "latched": MODES_LATCHED}
 
@@ -120,10 +126,13 @@ OBSERVER_GAINS = record_dtype(
         ("line_s", "f8"),  # the chamber's pressure trails the sensor's block by this
         ("play_ma", "f8"),  # half width of the valves' hysteresis that is compensated
         ("play_still_ma", "f8"),  # a smaller change of the wanted current does not turn the play round
+        ("teach_kpa", "f8"),  # below this chamber pressure the exhaust valve learns no faster than at it
+        ("growth_1_deg", "f8"),  # part by which the chamber's volume grows per degree of bending
         ("whiteness", "f8"),  # |autocorrelation| of the innovation from which the model is not trusted; 0: always trusted
     ]
 )
 PRESSURE_GAINS = record_dtype([(n, "f8") for n in ("k2", "epsilon2", "delta2")])
+VALVE_TEST_GAINS = record_dtype([("top_kpa", "f8"), ("low_kpa", "f8")])
 GAINS = record_dtype(
     [
         ("actuation", ACTUATION),
@@ -133,6 +142,7 @@ GAINS = record_dtype(
         ("smc", ARC_GAINS),
         ("arc_eso", ARC_ESO_GAINS),
         ("observer", OBSERVER_GAINS),
+        ("valve_test", VALVE_TEST_GAINS),
     ]
 )
 

@@ -176,6 +176,22 @@ def excitation(top_hz: float, seed: int, span_kpa: tuple[float, float] = EXCITAT
     return multi_sine(tones, span_kpa, EXCITATION_SECONDS, seed)
 
 
+def valve_steps(currents_ma: Floats, test_s: float, fill_s: float, empty_s: float, rest_s: float) -> Plan:
+    """Currents for flow tests of the valves: above zero the charge valve's, below zero the exhaust valve's; steps, not smooth.
+
+    For each current: rest, charge at it, rest, fill at the highest, rest, exhaust at it, rest, empty at the highest.
+    """
+    full = float(currents_ma.max())
+    values, lengths = [], []
+    for current in currents_ma.tolist():
+        for value, length in ((current, test_s), (full, fill_s), (-current, test_s), (-full, empty_s)):
+            values += [0.0, value]
+            lengths += [rest_s, length]
+    rows = np.zeros((len(values), 8))
+    rows[:, 0] = values
+    return Plan(POLYNOMIALS, np.concatenate([[0.0], np.cumsum(lengths)]), rows)
+
+
 def from_csv(path: Path) -> Plan:
     """A spline of degree seven through the rows `t_s, value` of a CSV file. Raises BadFile."""
     try:

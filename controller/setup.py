@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softloop.controller import references
-from softloop.controller.config import ControllerConfig
+from softloop.controller.config import ControllerConfig, ValveTestConfig
 from softloop.controller.feasibility import check_angle_plan, check_pressure_plan
 from softloop.controller.laws.arc import STEP1
 from softloop.controller.records import (
@@ -19,11 +19,11 @@ from softloop.controller.records import (
     CYCLE,
     GAINS,
     INPUTS,
-    LAW_PRESSURE,
     LAWS,
     MODE_HOLD,
     MODE_RULES,
     OBSERVED_LAWS,
+    PRESSURE_LAWS,
 )
 from softloop.controller.references import Plan
 from softloop.controller.tick import SCRATCH, controller_tick_of_arrays
@@ -33,6 +33,7 @@ from softloop.wire.kernel import new_record
 
 PERIOD_NS = 5_000_000  # the paper's sampling time
 MS = 1_000_000
+VALVE_STEPS = "valve_steps"
 
 
 @dataclass
@@ -68,18 +69,42 @@ def plan_of(config: ControllerConfig) -> Plan:
     """The trajectory a controller follows. Raises BadConfig when it does not fit the law, BadFile for a bad CSV file."""
     name, seed = config.trajectory, config.trajectory_seed
     excitations = {"excitation_1hz": 1.0, "excitation_05hz": 0.5}
+    if (name == VALVE_STEPS) != (config.law == "valve_test"):
+        raise BadConfig(f"[controller] trajectory '{VALVE_STEPS}' and law \"valve_test\" go together, and with no other")
+    if name == VALVE_STEPS:
+        return valve_plan(config.valve_test)
     if name in excitations:
-        if config.law != "pressure":
+        if config.law not in PRESSURE_LAWS:
             raise BadConfig(f"[controller] trajectory '{name}' is a pressure; it needs law = \"pressure\"")
         return references.excitation(excitations[name], seed)
     if name in ("t1", "t2"):
-        if config.law == "pressure":
+        if config.law in PRESSURE_LAWS:
             raise BadConfig(f"[controller] trajectory '{name}' is an angle; law \"pressure\" needs an excitation or a CSV in kPa")
         return references.point_to_point() if name == "t1" else references.t2(seed)
     path = Path(name)
     if not path.is_file():
-        raise BadConfig(f"[controller] trajectory '{name}': no such file, and not one of t1, t2, {', '.join(excitations)}")
+        raise BadConfig(
+            f"[controller] trajectory '{name}': no such file, and not one of t1, t2, {', '.join(excitations)}, {VALVE_STEPS}"
+        )
     return references.from_csv(path)
+
+
+def valve_plan(config: ValveTestConfig) -> Plan:
+    """The currents of flow tests. Raises BadConfig."""
+    if not config.first_ma < config.last_ma:
+        raise BadConfig(f"[controller.valve_test] first_ma must be below last_ma ({config.last_ma:g}), got {config.first_ma:g}")
+    currents = np.linspace(config.first_ma, config.last_ma, config.levels)
+    return references.valve_steps(currents, config.test_s, config.fill_s, config.empty_s, config.rest_s)
+
+
+def check_plan(config: ControllerConfig, plan: Plan, model: Any) -> None:
+    """Raise BadConfig where the rig cannot do what the trajectory asks for."""
+    if config.law in PRESSURE_LAWS:
+        check_pressure_plan(plan, model)
+    elif config.law != "valve_test":
+        check_angle_plan(plan, model)
+    elif config.valve_test.last_ma > model.current_max_ma:
+        raise BadConfig(f"[controller.valve_test] last_ma must be at most the valves' {model.current_max_ma:g} mA")
 
 
 def build(config: ControllerConfig, parameters: Parameters | None = None) -> Controller:
@@ -89,7 +114,7 @@ def build(config: ControllerConfig, parameters: Parameters | None = None) -> Con
     """
     model = model_record(parameters or parameters_of(config))
     plan = plan_of(config)
-    (check_pressure_plan if config.law == "pressure" else check_angle_plan)(plan, model)
+    check_plan(config, plan, model)
     state = np.zeros(1, CONTROLLER_STATE)
     state[0].theta[:] = model.theta
     state[0].mode = MODE_HOLD
@@ -125,7 +150,7 @@ def config_record(config: ControllerConfig, plan: Plan) -> Any:
     record.pressure_delay_ns = round(config.pressure_delay_ms * MS)
     record.inclination_delay_ns = round(config.inclination_delay_ms * MS)
     record.actuation_delay_ns = round(config.actuation_delay_ms * MS)
-    record.predict = config.predict
+    record.predict = config.predict and config.law != "valve_test"  # what is on the port then is not what the model has
     record.observe = config.law in OBSERVED_LAWS
     return record
 
@@ -138,12 +163,12 @@ def gains_record(config: ControllerConfig, model: Any) -> Any:
     gains.actuation.flow_hold_kpa_s = actuation.flow_hold_kpa_s
     gains.actuation.error_hold, gains.actuation.error_release = actuation.error_hold_deg, actuation.error_release_deg
     gains.actuation.rate_still_deg_s = actuation.rate_still_deg_s
-    if LAWS[config.law] == LAW_PRESSURE:  # its error is a pressure and its trajectory never dwells
+    if config.law in PRESSURE_LAWS:  # its error is a pressure and its trajectory never dwells
         gains.actuation.rate_still_deg_s = -1.0
     gains.actuation.switch_ticks = actuation.switch_ticks
     gains.actuation.bias_fraction = actuation.bias_fraction
     gains.actuation.current_max_ma = model.current_max_ma
-    for law in ("pid", "smc", "arc", "arc_eso", "pressure", "observer"):
+    for law in ("pid", "smc", "arc", "arc_eso", "pressure", "observer", "valve_test"):
         record, table = gains[law], getattr(config, law)
         for name in record.dtype.names:
             if name in type(table).model_fields and name not in ("gamma", "rate_limit"):

@@ -14,6 +14,7 @@ from softloop.controller.laws.arc_eso import arc_eso_step
 from softloop.controller.laws.pid import pid_step
 from softloop.controller.laws.pressure import pressure_step
 from softloop.controller.laws.smc import smc_step
+from softloop.controller.laws.valve_test import valve_test_step
 from softloop.controller.observer import begin_observer, observe
 from softloop.controller.records import (
     CONFIG_TYPE,
@@ -39,7 +40,9 @@ from softloop.controller.records import (
     LAW_PID,
     LAW_PID_ESO,
     LAW_PRESSURE,
+    LAW_PRESSURE_ESO,
     LAW_SMC,
+    LAW_VALVE_TEST,
     MEASUREMENT,
     MEASUREMENT_TYPE,
     MODE_HOLD,
@@ -54,7 +57,7 @@ from softloop.controller.records import (
     SAMPLE_OK,
     STATE_TYPE,
 )
-from softloop.controller.references import polynomial_at, reference_at
+from softloop.controller.references import SINES, polynomial_at, reference_at, sines_at
 from softloop.controller.valve_drive import drive_valves, note_flow
 from softloop.dynamics.parameters import MODEL_TYPE, THETA_TYPE
 from softloop.wire.kernel import array_of, kernel, record_dtype, record_type
@@ -95,15 +98,51 @@ def move_between(start: float, end: Any, seconds: float, coefficients: np.ndarra
     coefficients[7] = (-20.0 * gap + 10.0 * v - 2.0 * a + j / 6.0) / seconds**7
 
 
+@kernel(types.b1(CONFIG_TYPE))
+def fades_in(config: Any) -> bool:
+    """Whether a multi-sine, which goes on before its start too, is faded in from where the rig is.
+
+    Its derivatives are large: a polynomial of some seconds that ends with them swings far out of any valve's range.
+    """
+    return bool(config.plan_kind == SINES and (config.law == LAW_PRESSURE or config.law == LAW_PRESSURE_ESO))
+
+
+@kernel(types.void(CONFIG_TYPE, array_of(_F8), array_of(_F8, 2), _F8, STATE_TYPE, SCRATCH_TYPE))
+def plan_approach(config: Any, knots: np.ndarray, table: np.ndarray, start: float, state: Any, scratch: Any) -> None:
+    """The coefficients of the move from `start`: to the trajectory's first point, or, to fade in, by 1 and at rest."""
+    reference_at(config.plan_kind, knots, table, 0.0, scratch.end)
+    if fades_in(config):
+        scratch.end.value = start + 1.0
+        scratch.end.rate, scratch.end.acceleration, scratch.end.jerk = 0.0, 0.0, 0.0
+    move_between(start, scratch.end, 1e-9 * config.approach_ns, state.approach)
+
+
+@kernel(types.void(CONFIG_TYPE, array_of(_F8, 2), STATE_TYPE, _F8, REFERENCE_TYPE))
+def faded(config: Any, table: np.ndarray, state: Any, time_s: float, reference: Any) -> None:
+    """The multi-sine's share w grows from 0 to 1: start + w (sines - start) and its derivatives, between both at any time."""
+    start = state.approach[0]
+    sines_at(table, time_s - 1e-9 * config.approach_ns, reference)
+    p, p1, p2, p3 = reference.value - start, reference.rate, reference.acceleration, reference.jerk
+    polynomial_at(state.approach, time_s, reference)
+    w, w1, w2, w3 = reference.value - start, reference.rate, reference.acceleration, reference.jerk
+    reference.value = start + w * p
+    reference.rate = w1 * p + w * p1
+    reference.acceleration = w2 * p + 2.0 * w1 * p1 + w * p2
+    reference.jerk = w3 * p + 3.0 * w2 * p1 + 3.0 * w1 * p2 + w * p3
+
+
 @kernel(types.void(CONFIG_TYPE, MODEL_TYPE, INPUTS_TYPE, array_of(_F8), array_of(_F8, 2), STATE_TYPE, SCRATCH_TYPE))
 def begin_approach(config: Any, model: Any, inputs: Any, knots: np.ndarray, table: np.ndarray, state: Any, scratch: Any) -> None:
     """Start the smooth move from where the rig is to the trajectory's first point (value and three derivatives).
 
     Nothing of what was learned before is kept: what led to a fault may have taught it.
     """
-    reference_at(config.plan_kind, knots, table, 0.0, scratch.end)
-    start = inputs.pressure.chamber_pressure_kpa if config.law == LAW_PRESSURE else inputs.inclination.angle_deg
-    move_between(start, scratch.end, 1e-9 * config.approach_ns, state.approach)
+    start = inputs.inclination.angle_deg
+    if config.law in (LAW_PRESSURE, LAW_PRESSURE_ESO):
+        start = inputs.pressure.chamber_pressure_kpa
+    elif config.law == LAW_VALVE_TEST:  # a current
+        start = 0.0
+    plan_approach(config, knots, table, start, state, scratch)
     state.phase = PHASE_APPROACH
     state.phase_start_ns = inputs.now_ns
     state.pid.integral_kpa = inputs.pressure.chamber_pressure_kpa
@@ -143,6 +182,8 @@ def reference_now(config: Any, knots: np.ndarray, table: np.ndarray, state: Any,
     elif state.phase == PHASE_APPROACH and now_ns - state.phase_start_ns >= config.approach_ns:
         past_ns = now_ns - state.phase_start_ns - config.approach_ns
         reference_at(config.plan_kind, knots, table, 1e-9 * past_ns, reference)
+    elif fades_in(config):
+        faded(config, table, state, 1e-9 * (now_ns - state.phase_start_ns), reference)
     else:
         polynomial_at(state.approach, 1e-9 * (now_ns - state.phase_start_ns), reference)
 
@@ -158,8 +199,10 @@ def law_step(law: int, model: Any, measurement: Any, reference: Any, gains: Any,
         smc_step(model, measurement, reference, gains, state, first, demand)
     elif law == LAW_ARC_ESO:
         arc_eso_step(model, measurement, reference, gains, state, first, demand)
-    elif law == LAW_PRESSURE:
+    elif law in (LAW_PRESSURE, LAW_PRESSURE_ESO):
         pressure_step(measurement, reference, gains, state, demand)
+    elif law == LAW_VALVE_TEST:
+        valve_test_step(measurement, reference, gains, state, demand)
 
 
 @kernel(types.void(STATE_TYPE, DEMAND_TYPE))
@@ -212,7 +255,8 @@ def record_thoughts(config: Any, measurement: Any, reference: Any, demand: Any, 
     cycle.trajectory_ns = since_ns - (0 if on_plan else config.approach_ns)
     cycle.reference_deg, cycle.reference_rate_deg_s = reference.value, reference.rate
     cycle.reference_acceleration_deg_s2, cycle.reference_jerk_deg_s3 = reference.acceleration, reference.jerk
-    if config.law == LAW_PRESSURE:  # its trajectory is a pressure and stands in desired_pressure_kpa
+    # A pressure stands in desired_pressure_kpa, a current in the command.
+    if config.law in (LAW_PRESSURE, LAW_PRESSURE_ESO, LAW_VALVE_TEST):
         cycle.reference_deg, cycle.reference_rate_deg_s = np.nan, np.nan
         cycle.reference_acceleration_deg_s2, cycle.reference_jerk_deg_s3 = np.nan, np.nan
     cycle.angle_estimate_deg, cycle.rate_estimate_deg_s = measurement.angle_deg, measurement.rate_deg_s
@@ -272,9 +316,9 @@ def controller_tick(
     if active and config.observe:
         drive_valves(gains, model, measurement, demand, state)
         note_flow(gains, model, measurement, demand, state, inputs.skipped + 1)
-    elif active:
+    elif active and config.law != LAW_VALVE_TEST:
         actuate(gains.actuation, model, measurement, demand, state)
-    else:
+    elif not active:
         stand_still(state, demand)
     state.last_ns = inputs.now_ns
     state.seq += 1

@@ -14,6 +14,7 @@ from softloop.controller.actuation import current_for_flow, opening_current
 from softloop.controller.flows import remember_flow
 from softloop.controller.observer import valve_open
 from softloop.controller.records import DEMAND_TYPE, GAINS_TYPE, MEASUREMENT_TYPE, MODE_CHARGE, MODE_HOLD, STATE_TYPE
+from softloop.dynamics.gas import ATMOSPHERE_PA, PA_PER_KPA
 from softloop.dynamics.parameters import LEAK, MODEL_TYPE
 from softloop.dynamics.pneumatics import known_terms, pressure_rate
 from softloop.wire.kernel import kernel
@@ -37,13 +38,20 @@ def current_to_feel(wanted_ma: float, felt_ma: float, half_width_ma: float, stil
     return min(max(before_ma, felt_ma - half_width_ma), felt_ma + half_width_ma)
 
 
-@kernel(_F8(MODEL_TYPE, MEASUREMENT_TYPE, DEMAND_TYPE, STATE_TYPE, types.b1))
-def wanted_current(model: Any, measurement: Any, demand: Any, state: Any, charging: bool) -> float:
+@kernel(_F8(GAINS_TYPE, MEASUREMENT_TYPE))
+def growth_rate(gains: Any, measurement: Any) -> float:
+    """The pressure rate that the growing chamber takes, kPa/s: P V'/V of the absolute pressure, which Eq. 11 leaves out."""
+    absolute_kpa = measurement.chamber_kpa + ATMOSPHERE_PA / PA_PER_KPA
+    return absolute_kpa * gains.observer.growth_1_deg * measurement.rate_deg_s
+
+
+@kernel(_F8(GAINS_TYPE, MODEL_TYPE, MEASUREMENT_TYPE, DEMAND_TYPE, STATE_TYPE, types.b1))
+def wanted_current(gains: Any, model: Any, measurement: Any, demand: Any, state: Any, charging: bool) -> float:
     """The current that a valve should feel for the demanded flow, mA, not limited."""
     supply, chamber = measurement.supply_kpa, measurement.chamber_kpa
     offset = state.observer.charge_offset_ma if charging else state.observer.exhaust_offset_ma
     _, _, f3 = known_terms(model, charging, supply, chamber)
-    flow = demand.flow_kpa_s + f3 * state.theta[LEAK]
+    flow = demand.flow_kpa_s + f3 * state.theta[LEAK] + growth_rate(gains, measurement)
     return current_for_flow(model, state.theta, charging, supply, chamber, flow) + offset
 
 
@@ -59,7 +67,7 @@ def drive_valves(gains: Any, model: Any, measurement: Any, demand: Any, state: A
     state.saturated = 0
     if demand.mode != MODE_HOLD:
         charging = demand.mode == MODE_CHARGE
-        wanted = wanted_current(model, measurement, demand, state, charging)
+        wanted = wanted_current(gains, model, measurement, demand, state, charging)
         given = min(max(wanted, charge if charging else exhaust), top)  # a valve that is shut waits just below its opening
         state.saturated = wanted > top
         if charging:
@@ -81,6 +89,7 @@ def note_flow(gains: Any, model: Any, measurement: Any, demand: Any, state: Any,
         model, state.theta, measurement.supply_kpa, measurement.chamber_kpa,
         observer.charge_play_ma - observer.charge_offset_ma, observer.exhaust_play_ma - observer.exhaust_offset_ma,
     )  # fmt: skip
+    flow -= growth_rate(gains, measurement)
     if not valve_open(model, measurement.supply_kpa, state):
         flow += observer.hold_kpa_s
     remember_flow(observer, flow, ticks)

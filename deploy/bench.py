@@ -18,7 +18,7 @@ from zlib import crc32
 from pydantic import Field, ValidationError
 
 from softloop.controller.config import ControllerConfig
-from softloop.deploy.config import MachineConfig, RunConfig
+from softloop.deploy.config import CalibrationConfig, MachineConfig, RunConfig
 from softloop.deploy.hosts import check_hosts
 from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig, pressures_process, valves_process
 from softloop.plant.config import PlantConfig, plant_process
@@ -60,6 +60,7 @@ class Bench(Table):
     page: PageConfig = PageConfig()
     foxglove: FoxgloveConfig = FoxgloveConfig()
     faults: FaultsConfig = FaultsConfig()
+    calibration: CalibrationConfig | None = None
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ def monitor_process(table: MonitorConfig, controller: ControllerConfig) -> Monit
     """What the monitor is given of the controller's table."""
     gains = {"arc": controller.arc, "smc": controller.smc}.get(controller.law)
     law = None if gains is None else LawGains(**{f.name: getattr(gains, f.name) for f in fields(LawGains)})
-    return MonitorProcess(table, controller.parameters, law, controller.law != "pressure")
+    return MonitorProcess(table, controller.parameters, law, controller.law not in ("pressure", "pressure_eso", "valve_test"))
 
 
 def _check_together(bench: Bench, source: Source) -> None:

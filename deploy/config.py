@@ -1,4 +1,4 @@
-"""`[run]`: what the launcher does around a run."""
+"""`[run]`: what the launcher does around a run; `[calibration]`: what valves are measured with; `[hosts.NAME]`: the computers."""
 
 from __future__ import annotations
 
@@ -28,6 +28,14 @@ class RunConfig(Table):
     foreign_parameters: bool = Field(False, description="run on a parameter file that was identified on another rig")
     certificate: str = Field("", description="what `softloop doctor --certificate` wrote for this bench: it goes into the log")
     report: bool = Field(True, description="write report.html and its pictures at the end")
+
+
+class CalibrationConfig(Table):
+    """`[calibration]`: a tank of known volume on the rig's port, for flow tests of the valves."""
+
+    tank_ml: float = Field(gt=0, description="the tank with its tubing; it stands in the actuator's place")
+    tank_error_percent: float = Field(1.0, ge=0, lt=50, description="how well that is known, one standard error")
+    temperature_c: float = Field(20.0, ge=-20, le=60, description="of the room, and so of the tank's gas")
 
 
 class MachineConfig(Table):

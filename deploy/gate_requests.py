@@ -19,6 +19,7 @@ WANTED = {"arm": GATE_ARMED, "disarm": GATE_DISARMED, "stop": GATE_FAULT}
 # A request can be lost (nothing on the wires waits), so it is said again until the gate is where it should be.
 REPEAT_NS = 200_000_000
 POLL_S = 0.02
+ANEW_S = 0.7
 FIND_GATE_S = 3.0  # a gate speaks every 5 ms; joining takes well under a second
 
 
@@ -86,20 +87,24 @@ def request_once(bench: Bench, action: Action, timeout_s: float) -> int:
         Unavailable: no gate is running on this bench.
     """
     with open_wire(bench.zenoh, bench.name, f"request-{action}") as wire:
-        state = RigState(wire)
         requests = Requests(wire)
-        _wait_for_gate(bench, state, min(timeout_s, FIND_GATE_S))
+        state = _find_gate(bench, wire, min(timeout_s, FIND_GATE_S))
         obeyed = ask(requests, state, action, timeout_s)
     said = f"gate {GATES.get(state.gate or 0, '?')}" + ("" if state.reason == "none" else f" ({state.reason})")
     print(said if obeyed else f"refused: {said}", flush=True)
     return EXIT_OK if obeyed else EXIT_NEGATIVE
 
 
-def _wait_for_gate(bench: Bench, state: RigState, timeout_s: float) -> None:
+def _find_gate(bench: Bench, wire: Wire, timeout_s: float) -> RigState:
+    """What is heard, once the gate is. Listens anew now and then: what is declared while a link comes up can be lost on it."""
     deadline = time.monotonic() + timeout_s
-    while state.gate is None:
-        if time.monotonic() >= deadline:
-            where = bench.zenoh.meeting_point(bench.name)
-            raise Unavailable(f"no gate of bench '{bench.name}' is heard at {where}; is it running?")
-        time.sleep(POLL_S)
-        state.refresh()
+    while time.monotonic() < deadline:
+        state = RigState(wire)
+        anew = min(deadline, time.monotonic() + ANEW_S)
+        while state.gate is None and time.monotonic() < anew:
+            time.sleep(POLL_S)
+            state.refresh()
+        if state.gate is not None:
+            return state
+    where = bench.zenoh.meeting_point(bench.name)
+    raise Unavailable(f"no gate of bench '{bench.name}' is heard at {where}; is it running?")

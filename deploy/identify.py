@@ -22,6 +22,7 @@ from softloop.offline.identification.output_error import Fit, score
 from softloop.offline.identification.regression import as_fit, instrumental_variables, least_squares
 from softloop.offline.identification.series import Series, from_log
 from softloop.offline.identification.structure import PAPER, Structure, bare_of
+from softloop.offline.identification.valve_flow import NAMES as VALVE_NAMES
 from softloop.offline.identification.valve_flow import FlowTests, fit_valve
 from softloop.offline.identification.venting import fit_vent, score_vent
 from softloop.offline.run_log import open_run
@@ -108,22 +109,25 @@ def identify_valve(file: Path, columns: tuple[str, ...], discharge: float, tempe
     """Fit a valve to flow tests and say it; EXIT_NEGATIVE when the tests do not show all of its numbers."""
     taken = read_columns(file, parse_map(columns, ("current", "upstream", "downstream", "flow")))
     found = fit_valve(FlowTests(*(taken[k] for k in ("current", "upstream", "downstream", "flow"))), discharge, temperature_k)
-    sure = found.uncertainty
+    sure, whole = found.uncertainty, found.rank == len(VALVE_NAMES)
     rows: dict[str, dict[str, float]] = {}
     if sure is not None:
         rows = {
             n: {"value": v, "low": a, "high": b} for n, v, a, b in zip(sure.names, sure.values, *sure.interval(), strict=True)
         }
     if as_json:
-        six = found.coefficients() if sure is not None else {}
+        six = found.coefficients() if whole else {}
         print(json.dumps({"numbers": rows, "coefficients": six, "rank": found.rank, "fit": found.fit}, indent=2))
     else:
         print(f"flow fits {found.fit:.2f} % (NRMSE); rank {found.rank} of 5")
         for name, row in rows.items():
             print(f"{name} {row['value']:.4g} (95 %: {row['low']:.4g} to {row['high']:.4g})")
-        if sure is None:
-            print("not identifiable from these tests, so no number is given: vary both pressures, three or more of each")
-    return EXIT_OK if sure is not None else EXIT_NEGATIVE
+        hidden = ", ".join(n for n in VALVE_NAMES if n not in found.shown)
+        if hidden:
+            print(
+                f"not identifiable from these tests, so no number is given: {hidden}; vary both pressures, three or more of each"
+            )
+    return EXIT_OK if whole else EXIT_NEGATIVE
 
 
 def fitted(structure: Structure, train: Series, method: str, interval: str) -> tuple[Fit, Uncertainty]:

@@ -326,9 +326,17 @@ class Launch:
             return Outcome(EXIT_NEGATIVE, f"the gate went to FAULT: {self.state.reason}")
         if self.meeting.excuses:
             return None
-        if self.state.valves is not None and time.monotonic_ns() - self.state.valves_heard_ns > GATE_SILENT_NS:
+        if self._gate_is_silent():
             return Outcome(EXIT_LOST, "process 'valves' is silent: nothing heard from the gate for a second")
         return None
+
+    def _gate_is_silent(self) -> bool:
+        """Nothing has come from it for a second; what came while this launcher did something else counts."""
+        if self.state.valves is None or time.monotonic_ns() - self.state.valves_heard_ns <= GATE_SILENT_NS:
+            return False
+        for line in self.state.refresh():
+            self.view.say(line)
+        return time.monotonic_ns() - self.state.valves_heard_ns > GATE_SILENT_NS
 
     def _without_router(self) -> Outcome | None:
         run = self.bench.run

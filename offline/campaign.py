@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from softloop.controller.config import ControllerConfig
+from softloop.controller.records import ANGLE_LAWS
 from softloop.controller.setup import plan_of
 from softloop.offline.closed_loop import SETTLE_S, RigTables, simulate_tables
 from softloop.offline.evaluation import tuned
@@ -117,8 +118,8 @@ def controller_for(tables: RigTables, case: Case) -> ControllerConfig:
     base = tuned(case.law)[0] if case.tuned else tables.controller
     content = base.model_dump() | {"law": case.law, "trajectory": case.trajectory}
     config = ControllerConfig.model_validate(content)
-    if config.law == "pressure":
-        raise BadConfig('law "pressure" follows a pressure: a campaign judges angles')
+    if config.law not in ANGLE_LAWS:
+        raise BadConfig(f'law "{config.law}" follows no angle: a campaign judges angles')
     return config
 
 

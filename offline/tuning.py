@@ -22,6 +22,9 @@ import numpy as np
 from pydantic import ValidationError
 
 from softloop.controller.config import ControllerConfig
+from softloop.controller.records import PRESSURE_LAWS
+from softloop.offline.closed_loop import simulate_run
+from softloop.offline.excitation import BAR_KPA, run_tracking
 from softloop.offline.trials import Trial, run_trial
 from softloop.plant.config import PlantConfig
 
@@ -32,6 +35,8 @@ BARS_DEG = {"t1": 1.0, "steady": 0.3, "t2": 1.0, "peak": 1.5}
 SWITCHES_PER_S = 10.0
 QUIET_PER_S = 5.0  # half the bar: rigs not tuned on switched up to 1.4 times as much (seeds 1008:1028), and a real rig may more
 LOST = 1e4
+EXCITATION_APPROACH_S = 10.0  # long enough that both valves have worked, and are known, before the trajectory begins
+EXCITATIONS = ("excitation_1hz", "excitation_05hz")
 STEP_US = 1000  # of the plant while tuning; evaluation takes the bench file's own
 
 _DRIVE: Ranges = {"actuation.flow_hold_kpa_s": (2.0, 60.0), "actuation_delay_ms": (1.0, 10.0)}
@@ -64,8 +69,18 @@ RANGES: dict[str, Ranges] = {
     "smc": _of("smc", _BACKSTEPPING | _ROBUST) | _DRIVE,
     "arc": _of("arc", _BACKSTEPPING | _ROBUST | {"gamma": (1e-6, 1e-3), "gamma_valve": (1e-7, 1e-4)}) | _DRIVE,
     "arc_eso": _of("arc_eso", _BACKSTEPPING) | _OBSERVER | _DRIVE,
+    "pressure": {"pressure.k2": (5.0, 100.0), "pressure.delta2": (2.0, 200.0), "pressure.epsilon2": (1e2, 1e5)} | _DRIVE,
+    "pressure_eso": {
+        "pressure.k2": (5.0, 100.0),
+        "observer.pressure_1_s": (15.0, 150.0),
+        "observer.play_ma": (3.0, 16.0),
+        "observer.play_still_ma": (0.05, 3.0),
+        "observer.teach_kpa": (10.0, 90.0),
+        "observer.growth_1_deg": (5e-4, 5e-3),
+    }
+    | _DRIVE,
 }
-OBSERVED = ("pid_eso", "arc_eso")
+OBSERVED = ("pid_eso", "arc_eso", "pressure_eso")
 
 
 # Restless valves buy accuracy that the bars do not ask for: one switch per second too many costs as much as half a bar of error.
@@ -108,7 +123,11 @@ class Tuned:
 
 def start_config(law: str) -> ControllerConfig:
     """What is not tuned, and the same for all: a valve keeps its turn, and the one that waits is nearly open."""
-    return ControllerConfig.model_validate({"law": law, "actuation": {"modes": "latched", "bias_fraction": 0.9}})
+    content: dict[str, Any] = {"law": law, "actuation": {"modes": "latched", "bias_fraction": 0.9}}
+    if law == "pressure_eso":  # its observer finds what Delta_2 is, so that no robust term is needed
+        content |= {"pressure": {"delta2": 0.0}, "approach_s": EXCITATION_APPROACH_S}
+        content["observer"] = {"rate_1_s": 130.0}  # the gyro tells how fast the chamber grows
+    return ControllerConfig.model_validate(content)
 
 
 def with_gains(base: ControllerConfig, gains: dict[str, float]) -> ControllerConfig:
@@ -138,6 +157,8 @@ def cost_of(t1: Trial | None, t2: Trial | None) -> float:
 def cost(controller: ControllerConfig, latency: Latency, seeds: Sequence[int]) -> float:
     """Mean of the mean and the worst over the tuning rigs, which take turns: T1 with payload, then T2."""
     told = latency.controller(controller)
+    if told.law in PRESSURE_LAWS:
+        return pressure_cost(told, latency, seeds)
     costs: tuple[list[float], list[float]] = ([], [])
     for place, seed in enumerate(seeds):
         plant = latency.plant(PlantConfig(seed=seed, step_us=STEP_US))
@@ -146,6 +167,18 @@ def cost(controller: ControllerConfig, latency: Latency, seeds: Sequence[int]) -
         else:
             costs[1].append(cost_of(None, run_trial(told.model_copy(update={"trajectory": "t2"}), plant)))
     return min(sum(0.5 * (float(np.mean(c)) + max(c)) for c in costs if c), LOST)
+
+
+def pressure_cost(told: ControllerConfig, latency: Latency, seeds: Sequence[int]) -> float:
+    """Mean of the mean and the worst over the tuning rigs of the largest error, in bars; they take turns on the multi-sines."""
+    costs = []
+    for place, seed in enumerate(seeds):
+        trajectory = EXCITATIONS[place % len(EXCITATIONS)]
+        own = told.model_copy(update={"trajectory": trajectory, "trajectory_seed": seed})
+        run = simulate_run(own, latency.plant(PlantConfig(seed=seed, step_us=STEP_US)))
+        tracking = run_tracking(run, own.actuation_delay_ms) if run.completed else None
+        costs.append(LOST if tracking is None else tracking.max_kpa / BAR_KPA + tracking.rms_kpa / BAR_KPA)
+    return min(0.5 * (float(np.mean(costs)) + max(costs)), LOST)
 
 
 def tune(

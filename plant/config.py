@@ -13,6 +13,8 @@ from softloop.wire.benchfile import ProcessTable, Table
 from softloop.wire.can_config import CanConfig
 from softloop.wire.errors import BadConfig
 
+LEAST_TANK_ML = 100.0
+
 
 class SensorConfig(Table):
     """A pressure sensor as its data sheet has it; the rig layer adds this specimen's errors."""
@@ -87,6 +89,8 @@ class PlantConfig(ProcessTable):
 
     supply_sensor: SensorConfig = SensorConfig()
     chamber_sensor: SensorConfig = SensorConfig()
+    supply_kpa: float | None = Field(None, gt=20, le=240, description="what the supply is set to, gauge; default: drawn by seed")
+    tank_ml: float = Field(0.0, ge=0, le=20_000, description="a rigid, isothermal tank on the port, not the actuator; 0: none")
     ambient_c: float | None = Field(None, ge=-20, le=60, description="of room, air and silicone; default: drawn by seed")
     pressure_noise_kpa: float = Field(0.1, ge=0, description="standard deviation of a pressure reading's noise")
     pressure_rise_ms: float = Field(3.0, ge=0, description="10 to 90 % of the sensors; none in the ideal layer")
@@ -108,6 +112,8 @@ class PlantConfig(ProcessTable):
 
     @model_validator(mode="after")
     def _known_device_settings(self) -> PlantConfig:
+        if 0.0 < self.tank_ml < LEAST_TANK_ML:
+            raise ValueError(f"tank_ml must be 0 or at least {LEAST_TANK_ML:g}: its tubing alone has 10 ml")
         for name, codes in (("baud", BAUD_CODES), ("rate_hz", RATE_CODES), ("bandwidth_hz", BANDWIDTH_CODES)):
             if getattr(self, name) not in codes:
                 raise ValueError(f"{name} must be one of {', '.join(map(str, codes))}")

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from softloop.dynamics.bending import rest_angle
 from softloop.dynamics.gas import ATMOSPHERE_PA, GAS_CONSTANT, KAPPA, PA_PER_KPA, mass_flux
-from softloop.dynamics.parameters import KV1_CHARGE, KV1_EXHAUST, KV6_CHARGE, KV6_EXHAUST, LEAK, Parameters, model_record
+from softloop.dynamics.parameters import B0, KV1_CHARGE, KV1_EXHAUST, KV6_CHARGE, KV6_EXHAUST, LEAK, Parameters, model_record
 from softloop.plant.mismatch import Draws, draw
 from softloop.plant.records import N_IDEAL, N_STATES, PLANT
 from softloop.wire.kernel import new_record
@@ -53,6 +53,8 @@ STOP_DEG = (2.0, 6.0, 16.0, 40.0)
 HYSTERESIS_DEG_S2 = 200.0
 CREEP_S = (1.0, 8.0, 60.0)
 CREEP_1_S2 = (2.0, 2.0, 2.0)
+# A calibration tank filled with copper wool, which keeps its gas near the wall's temperature (ISO 6358).
+TANK_WALL_LAG_S = 0.02
 PAYLOAD_ARM_M = 0.1  # tip mass to joint, for its inertia
 CONTACT_S_DEG = 0.02
 ZERO_C_K = 273.15
@@ -133,3 +135,13 @@ def _add_rig_air(air: Any, drawn: Draws, current_max_ma: float) -> None:
     air.coil_lag_s = COIL_LAG_S
     air.play_charge_ma = 0.5 * drawn.play_fraction[0] * current_max_ma
     air.play_exhaust_ma = 0.5 * drawn.play_fraction[1] * current_max_ma
+
+
+def fit_tank(plant: Any, tank_m3: float) -> None:
+    """Put a tight, rigid, isothermal tank of `tank_m3`, tubing included, on the port; the actuator is off and rests."""
+    air = plant.air
+    air.volume_m3 = tank_m3 - air.tube_volume_m3
+    air.volume_per_deg = air.leak_m2 = air.leak_laminar_kg_s_pa = 0.0
+    gas_kg = (PA_PER_KPA * TUBE_LAG_AT_KPA + ATMOSPHERE_PA) * air.volume_m3 / (GAS_CONSTANT * air.wall_k)
+    air.wall_w_k = gas_kg * GAS_CONSTANT / (KAPPA - 1.0) / TANK_WALL_LAG_S
+    plant.mechanics.theta[B0] = 0.0

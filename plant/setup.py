@@ -15,7 +15,7 @@ from softloop.plant.faults import FAULTS, plan_faults
 from softloop.plant.inclinometer_device import InclinometerDevice
 from softloop.plant.loads import plan_loads
 from softloop.plant.mismatch import Draws, draw
-from softloop.plant.parameters import draw_rig
+from softloop.plant.parameters import draw_rig, fit_tank
 from softloop.plant.physics import settle_inputs
 from softloop.plant.records import (
     ANGLE,
@@ -56,6 +56,10 @@ def plant_record(config: PlantConfig, wires: WireTimes | None = None) -> Any:
     """The `PLANT` record of a `[plant]` table. Raises BadFile or BadConfig when its parameter file is not usable."""
     parameters, wires = plant_parameters(config), wires or WireTimes()
     plant = draw_rig(config.layer, config.seed, parameters, config.ambient_c)
+    if config.supply_kpa is not None:
+        plant.air.supply_kpa = config.supply_kpa
+    if config.tank_ml:
+        fit_tank(plant, 1e-6 * config.tank_ml)
     drawn = draw(config.seed) if config.layer == "rig" else Draws(phases=draw(config.seed).phases)
     plant.step_ns = config.step_us * 1000
     electrical = plant.electrical

@@ -64,7 +64,8 @@ def _say(model: type[BaseModel], error: Any) -> str:
         return f"key '{name}' is missing"
     shown = repr(error.get("input"))
     shown = shown if len(shown) <= 60 else shown[:57] + "..."
-    return f"key '{name}': {error['msg'].removeprefix('Value error, ')} (got {shown})"
+    what = " ".join(error["msg"].removeprefix("Value error, ").split())  # a value in it may hold what ends a line
+    return f"key '{name}': {what} (got {shown})"
 
 
 def _allowed(model: type[BaseModel], where: list[str]) -> list[str]:

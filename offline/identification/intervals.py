@@ -28,6 +28,7 @@ LEVEL = 0.95
 ORDER_MOST = 40  # of the autoregressive model
 BLOCK_S = 10.0
 DRAWS = 400
+MOVED = 1e-2  # a direction without information moves an unknown when it has this part of it
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,16 @@ def information_rank(jacobian: Floats, tolerance: float = 1e-8) -> tuple[int, Fl
     values = np.linalg.svd(jacobian / np.where(length > 0, length, 1.0), compute_uv=False)
     relative: Floats = np.asarray(values / max(float(values[0]), 1e-300), np.float64)
     return int(np.sum(relative > tolerance)), relative
+
+
+def shown_alone(jacobian: Floats, tolerance: float = 1e-8) -> NDArray[np.bool_]:
+    """Which unknowns the data show each by itself, (q,): those that no direction without information moves."""
+    length = np.linalg.norm(jacobian, axis=0)
+    _, values, rows = np.linalg.svd(jacobian / np.where(length > 0, length, 1.0), full_matrices=True)
+    strength = np.zeros(jacobian.shape[1])
+    strength[: len(values)] = values / max(float(values[0]), 1e-300)
+    blind = rows[strength <= tolerance]
+    return np.asarray((length > 0) & (np.abs(blind).max(axis=0, initial=0.0) < MOVED), np.bool_)
 
 
 def _damped_inverse(square: Floats) -> Floats:

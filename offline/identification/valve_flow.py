@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from softloop.dynamics.gas import ATMOSPHERE_PA, PA_PER_KPA, mass_flux
 from softloop.dynamics.parameters import VALVE_SHAPE, VALVE_SHAPE_TYPE
 from softloop.dynamics.valve import orifice_area
-from softloop.offline.identification.intervals import Uncertainty, information_rank
+from softloop.offline.identification.intervals import Uncertainty, information_rank, shown_alone
 from softloop.offline.identification.series import nrmse_fit
 from softloop.wire.errors import BadFile
 from softloop.wire.kernel import array_of, kernel, new_record
@@ -48,8 +48,8 @@ class ValveFit:
     """A valve's five numbers.
 
     Attributes:
-        uncertainty: of NAMES; None where the rank is not full, since then no number means anything.
-        values: (5,), one of many that fit where the rank is not full.
+        uncertainty: of those of NAMES that the tests show, all where the rank is full; None where they show none of them.
+        values: (5,), of NAMES; what the tests do not show is one value of many that fit.
         rank: of the information matrix, at most 5.
         fit: NRMSE fit of the flow, %.
     """
@@ -58,6 +58,11 @@ class ValveFit:
     values: Floats
     rank: int
     fit: float
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """The names that the tests show."""
+        return self.uncertainty.names if self.uncertainty else ()
 
     def coefficients(self) -> dict[str, float]:
         """All six coefficients of Eq. 16."""
@@ -103,8 +108,16 @@ def fit_valve(tests: FlowTests, discharge: float = 1.0, temperature_k: float = 2
     rank, _ = information_rank(best.jac, RANK_TOLERANCE)
     values = best.x * SCALE
     fit = nrmse_fit(tests.flow_kg_s, modelled(values, tests, discharge, temperature_k))
-    if rank < len(NAMES):
+    shown = shown_alone(best.jac, RANK_TOLERANCE)
+    if not shown.any():
         return ValveFit(None, values, rank, fit)
-    noise = float(best.fun @ best.fun) / max(len(best.fun) - len(NAMES), 1)
-    covariance = np.linalg.inv(best.jac.T @ best.jac) * noise * np.outer(SCALE, SCALE)
-    return ValveFit(Uncertainty(NAMES, values, covariance, float(len(best.fun) - len(NAMES)), "white"), values, rank, fit)
+    degrees = max(len(best.fun) - rank, 1)
+    length = np.linalg.norm(best.jac, axis=0)
+    length[length == 0.0] = 1.0
+    square = (best.jac / length).T @ (best.jac / length)
+    inverse = np.linalg.pinv(square, rcond=RANK_TOLERANCE**2, hermitian=True) / np.outer(length, length)
+    covariance = inverse * float(best.fun @ best.fun) / degrees * np.outer(SCALE, SCALE)
+    names = tuple(n for n, s in zip(NAMES, shown, strict=True) if s)
+    return ValveFit(
+        Uncertainty(names, values[shown], covariance[np.ix_(shown, shown)], float(degrees), "white"), values, rank, fit
+    )

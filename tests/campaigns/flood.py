@@ -36,7 +36,8 @@ def bench_text(folder, mode):
     """A rig over TLS that tracks until it is ended, with budgets that a busy machine keeps."""
     times = np.arange(0.0, 600.0, 0.05)
     np.savetxt(folder / "wave.csv", np.c_[times, 60 + 10 * np.sin(times / 3)], delimiter=",", header="t_s,angle_deg")
-    table = f'[controller]\ntrajectory = "{folder}/wave.csv"\napproach_s = 2.0\n[run]\nreport = false\n[monitor]\n'
+    run = "[run]\nreport = false\nready_timeout_s = 90.0\n[monitor]\n"
+    table = f'[controller]\ntrajectory = "{folder}/wave.csv"\napproach_s = 2.0\n{run}'
     return f'base = "{folder}/wide.toml"\n{zenoh_table(folder, mode)}{table}'
 
 

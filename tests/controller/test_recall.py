@@ -12,9 +12,11 @@ from softloop.controller.setup import PERIOD_NS, build
 NOT_STATE = {"arc", "started", "approach_ns"}
 
 
-@pytest.fixture(params=["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure"])
+@pytest.fixture(params=list(r.LAWS))
 def controller(request):
-    trajectory = "excitation_1hz" if request.param == "pressure" else "t1"
+    trajectory = {"pressure": "excitation_1hz", "pressure_eso": "excitation_1hz", "valve_test": "valve_steps"}.get(
+        request.param, "t1"
+    )
     return build(ControllerConfig(law=request.param, trajectory=trajectory, approach_s=0.1))
 
 

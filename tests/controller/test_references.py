@@ -14,6 +14,7 @@ from softloop.controller.references import (
     point_to_point,
     smooth_move,
     t2,
+    valve_steps,
 )
 from softloop.controller.setup import build, plan_of
 from softloop.controller.tick import move_between
@@ -106,6 +107,9 @@ def test_trajectories_that_do_not_fit_the_law_are_refused():
         plan_of(ControllerConfig(law="arc", trajectory="excitation_1hz"))
     with pytest.raises(BadConfig, match="is an angle"):
         plan_of(ControllerConfig(law="pressure", trajectory="t1"))
+    for law, trajectory in (("valve_test", "t1"), ("arc", "valve_steps")):
+        with pytest.raises(BadConfig, match="go together"):
+            plan_of(ControllerConfig(law=law, trajectory=trajectory))
     with pytest.raises(BadConfig, match="no such file, and not one of t1, t2"):
         plan_of(ControllerConfig(trajectory="t3"))
 
@@ -126,3 +130,24 @@ def test_an_infeasible_reference_says_where_and_why(tmp_path, low, high, hz, wor
     with pytest.raises(BadConfig, match="not feasible") as caught:
         build(ControllerConfig(trajectory=str(file)))
     assert word in str(caught.value)
+
+
+def test_flow_tests_charge_and_exhaust_at_each_current_from_rest():
+    plan = valve_steps(np.array([80.0, 120.0]), 3.0, 2.0, 4.0, 0.5)
+    assert plan.duration_s == 2 * (3.0 + 2.0 + 3.0 + 4.0 + 4 * 0.5)
+    middles = 0.5 * (plan.knots[:-1] + plan.knots[1:])
+    currents = [float(plan.at(t).value) for t in middles]
+    assert currents[::2] == [0.0] * 8
+    assert currents[1::2] == [80.0, 120.0, -80.0, -120.0, 120.0, 120.0, -120.0, -120.0]
+
+
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        ({"first_ma": 100.0, "last_ma": 90.0}, "first_ma must be below last_ma"),
+        ({"last_ma": 500.0}, "at most the valves' 220 mA"),
+    ],
+)
+def test_currents_that_no_valve_can_have_are_refused(given, word):
+    with pytest.raises(BadConfig, match=word):
+        build(ControllerConfig.model_validate({"law": "valve_test", "trajectory": "valve_steps", "valve_test": given}))

@@ -10,8 +10,11 @@ from hypothesis import strategies as st
 from softloop.controller import records as r
 from softloop.controller.config import ControllerConfig
 from softloop.controller.setup import PERIOD_NS, build
+from softloop.controller.tick import reference_now
+from softloop.wire.kernel import new_record
 
 MS = 1_000_000
+TRAJECTORIES = {"pressure": "excitation_1hz", "pressure_eso": "excitation_1hz", "valve_test": "valve_steps"}
 
 
 def fed(controller, tick, armed=True, angle=26.75, pressure=0.5, age_ns=3 * MS, status=0, rate=0.0):
@@ -27,10 +30,10 @@ def fed(controller, tick, armed=True, angle=26.75, pressure=0.5, age_ns=3 * MS, 
 
 
 def built(law):
-    return build(ControllerConfig(law=law, trajectory="excitation_1hz" if law == "pressure" else "t1", approach_s=0.05))
+    return build(ControllerConfig(law=law, trajectory=TRAJECTORIES.get(law, "t1"), approach_s=0.05))
 
 
-@pytest.fixture(params=["pid", "pid_eso", "smc", "arc", "arc_eso", "pressure"])
+@pytest.fixture(params=list(r.LAWS))
 def law(request):
     return request.param
 
@@ -88,7 +91,7 @@ def test_rearming_begins_anew_from_what_is_measured(controller, law):
         "adapting",
     ):
         np.testing.assert_array_equal(first[name], expected[name], err_msg=name)
-    if law != "pressure":
+    if law in r.ANGLE_LAWS:
         assert first.reference_deg == 55.0
 
 
@@ -159,3 +162,28 @@ def test_no_number_on_the_inputs_makes_it_stop_or_ask_for_the_impossible(angle, 
         assert not cycle.inputs_valid
     for current in (cycle.charge_current_ma, cycle.exhaust_current_ma):
         assert np.isnan(current) or 0.0 <= current <= 220.0
+
+
+@pytest.mark.parametrize("law", r.PRESSURE_LAWS)
+def test_a_multi_sine_is_faded_in_and_never_leaves_the_range_between(law):
+    """A polynomial with the multi-sine's derivatives at its end went below the room's pressure on its way."""
+    controller = build(ControllerConfig(law=law, trajectory="excitation_1hz", approach_s=4.0))
+    fed(controller, 0, pressure=0.5)
+    start_ns, point = int(controller.state[0].phase_start_ns), new_record(r.REFERENCE)
+
+    def at(time_s):
+        reference_now(
+            controller.config[0], controller.plan.knots, controller.plan.table, controller.state[0],
+            start_ns + round(1e9 * time_s), point,
+        )  # fmt: skip
+        return np.array([point.value, point.rate, point.acceleration, point.jerk])
+
+    values = np.array([at(t)[0] for t in np.arange(0.0, 6.0, 0.005)])
+    assert values[0] == 0.5
+    assert values.min() >= 0.5
+    assert values.max() <= 110.0
+    assert np.abs(at(0.0)[1:]).max() < 1e-6
+    h = 1e-4
+    for time_s in (0.5, 1.7, 2.9, 3.7, 3.99, 4.0, 4.5):
+        here, numeric = at(time_s), (at(time_s + h) - at(time_s - h))[:3] / (2 * h)
+        assert numeric == pytest.approx(here[1:], rel=1e-3, abs=2e-2)

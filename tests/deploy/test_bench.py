@@ -38,7 +38,7 @@ def write(folder, text, name="bench.toml"):
     [
         (
             ("[can.can0]", "speed = 1\n[can.can0]"),
-            "unknown key 'speed'; allowed here: can, clock, controller, faults, foxglove, ",
+            "unknown key 'speed'; allowed here: calibration, can, clock, controller, faults, foxglove, ",
         ),
         (("[recorder]", "[recorder]\nfiel = 'a'"), "unknown key 'recorder.fiel'; allowed here: backlog_messages, "),
         (("[controller]", "[controller]\nlaw = 'lqr'"), "key 'controller.law': Input should be 'pid', "),

@@ -173,6 +173,9 @@ class FakeWire:
     def publisher(self, _channel):
         return self.sent.append
 
+    def may_put(self, _channel):
+        return True
+
 
 @pytest.mark.parametrize(("gate", "sends"), [(2, 1), (0, 3)])
 def test_a_gate_in_fault_is_asked_to_arm_once_only(gate, sends):

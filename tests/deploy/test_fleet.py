@@ -12,13 +12,16 @@ import pytest
 
 from softloop.deploy.bench import load_bench
 from softloop.deploy.children import Children
-from softloop.deploy.fleet import Fleet
+from softloop.deploy.fleet import DRIFT, STEP, SURE, UNSURE, Fleet
 from softloop.deploy.hosts import digest
 from softloop.deploy.launcher import launch_class
 from softloop.deploy.live import PlainView
 from softloop.deploy.router import launcher_wire
 from softloop.deploy.run_dir import keep_bench
+from softloop.wire.channels import CLOCK
 from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_OK, EXIT_USAGE, Unavailable
+from softloop.wire.messages import message
+from softloop.wire.session import open_wire
 from softloop.wire.shell import Stop
 
 TOY = (sys.executable, str(Path(__file__).with_name("toy_node.py")))
@@ -218,3 +221,41 @@ def test_a_gate_that_is_elsewhere_and_faults_ends_the_run_with_its_reason(start)
     hosts = [start("bench", {"valves": "faults"}), start("desk"), start("log")]
     assert finish(*hosts) == [1, 1, 1]
     assert hosts[1].outcome.text == "the gate went to FAULT: sensor stale"
+
+
+def test_steps_drifts_and_doubts_of_a_clock_are_said_by_the_host_that_leads(folder):
+    text = BENCH.replace("{folder}", str(folder)).replace("{mode}", "client").replace("{wait_s}", "1")
+    (folder / "fleet.toml").write_text(text)
+    bench, said, kind = load_bench(folder / "fleet.toml"), [], message("ClockOffset")
+    with launcher_wire(bench, "desk") as wire, open_wire(bench.zenoh, bench.name, "other") as other:
+        fleet = Fleet(bench, "desk", wire, 1, lambda *event: said.append(event))
+        put, seq = other.publisher(CLOCK), 0
+        for values in (
+            {"uncertainty_ns": 10_000_000},
+            {"uncertainty_ns": 600_000_000},
+            {"uncertainty_ns": 10_000_000, "steps": 1, "step_ns": -3_000_000},
+            {"uncertainty_ns": 10_000_000, "steps": 1, "drifts": 1, "drift_ppm": 250.0},
+        ):
+            before, end = len(said), time.monotonic() + 20.0
+            while len(said) == before:  # what is put before the two are linked is lost; each is one event, however often said
+                assert time.monotonic() < end, said
+                seq += 1
+                put(kind.pack(kind.make(seq=seq, host=0, **values)))
+                time.sleep(0.02)
+                fleet.look()
+            if values["uncertainty_ns"] > 500_000_000:
+                assert said[-1] == (UNSURE, 0, 600.0)
+            while wire_has_more(fleet, said):
+                pass
+        put(b"nothing")
+        fleet.look()
+        fleet.close()
+    assert said == [(SURE, 0, 10.0), (UNSURE, 0, 600.0), (STEP, 0, -3.0), (SURE, 0, 10.0), (DRIFT, 0, 250.0)]
+
+
+def wire_has_more(fleet, said):
+    """Words of the last kind that are under way make no event any more; wait until none comes."""
+    before = len(said)
+    time.sleep(0.1)
+    fleet.look()
+    return len(said) != before

@@ -5,7 +5,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from softloop.deploy.bench import find_bench, load_bench
@@ -136,6 +136,7 @@ def values():
 KEYS = ["at_s", "duration_s", "target", "size", "probability", "extra"]
 
 
+@example("can_drop", {"target": "a\x85b"})
 @given(st.sampled_from(PLANT_KINDS + HOST_KINDS), st.dictionaries(st.sampled_from(KEYS), values(), max_size=4))
 def test_no_content_of_an_injection_is_more_than_one_line(kind, changed):
     content = tomllib.loads(GOOD)

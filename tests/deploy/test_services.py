@@ -7,6 +7,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -192,22 +193,29 @@ print(json.dumps({
 
 
 @pytest.fixture
-def tree(tmp_path):
+def open_path():
+    """A folder that others may enter, which one of pytest's is not: all those above it are shut to them."""
+    path = Path(tempfile.mkdtemp(prefix="sl-"))
+    path.chmod(0o755)
+    yield path
+    shutil.rmtree(path)
+
+
+@pytest.fixture
+def tree(open_path):
     """The package as files without links, which nobody but root may change, and a cache folder of the unprivileged user's."""
     source = Path(errors.__file__).resolve().parent.parent
     for room in ("wire", "devices"):
-        shutil.copytree(source / room, tmp_path / "tree" / "softloop" / room, ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "tree" / "softloop" / "__init__.py").touch()
-    for path in [*(tmp_path / "tree").rglob("*"), tmp_path / "tree"]:
+        shutil.copytree(source / room, open_path / "tree" / "softloop" / room, ignore=shutil.ignore_patterns("__pycache__"))
+    (open_path / "tree" / "softloop" / "__init__.py").touch()
+    for path in [*(open_path / "tree").rglob("*"), open_path / "tree"]:
         path.chmod(stat.S_IMODE(path.stat().st_mode) & 0o555 | 0o444 | (0o111 if path.is_dir() else 0))
-    for path in (tmp_path, *list(tmp_path.parents)[:2]):
-        path.chmod(0o755)
-    cache = tmp_path / "cache"
+    cache = open_path / "cache"
     cache.mkdir()
     if os.getuid() == 0:
         os.chown(cache, NOBODY, NOBODY)
-    yield tmp_path
-    for path in [tmp_path / "tree", *(tmp_path / "tree").rglob("*")]:
+    yield open_path
+    for path in [open_path / "tree", *(open_path / "tree").rglob("*")]:
         path.chmod(0o755)
 
 

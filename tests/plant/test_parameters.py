@@ -1,12 +1,15 @@
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from softloop.dynamics.bending import bending_drift
 from softloop.dynamics.gas import ATMOSPHERE_PA, mass_flux
-from softloop.dynamics.parameters import LEAK, load_parameters, model_record, shipped
+from softloop.dynamics.parameters import B0, LEAK, load_parameters, model_record, shipped
 from softloop.plant import records
+from softloop.plant.config import PlantConfig
 from softloop.plant.mismatch import draw
 from softloop.plant.parameters import HYSTERESIS_DEG_S2, draw_rig
+from softloop.plant.setup import plant_record
 
 PARAMETERS = load_parameters(shipped())
 MODEL = model_record(PARAMETERS)
@@ -63,3 +66,17 @@ def fields(dtype):
 def test_no_field_hides_behind_an_attribute_of_numpys_records(dtype):
     # A field called `size` would read 1 in plain Python and its value when compiled.
     assert [name for name in fields(dtype) if hasattr(np.void, name)] == []
+
+
+@pytest.mark.parametrize("layer", ["ideal", "rig"])
+def test_a_tank_is_tight_rigid_and_of_its_volume_and_moves_no_actuator(layer):
+    params = plant_record(PlantConfig(layer=layer, tank_ml=500.0, supply_kpa=170.0))
+    air = params.air
+    assert air.volume_m3 + air.tube_volume_m3 == pytest.approx(500e-6, rel=1e-12)
+    assert (air.leak_m2, air.leak_laminar_kg_s_pa, air.volume_per_deg, air.supply_kpa) == (0.0, 0.0, 0.0, 170.0)
+    assert params.mechanics.theta[B0] == 0.0
+
+
+def test_a_tank_smaller_than_its_tubing_is_refused():
+    with pytest.raises(ValidationError, match="tank_ml must be 0 or at least 100"):
+        PlantConfig(tank_ml=20.0)

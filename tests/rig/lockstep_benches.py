@@ -4,7 +4,7 @@ import subprocess
 import sys
 from contextlib import contextmanager
 
-LAWS = ("arc", "arc_eso", "smc", "pid", "pid_eso", "pressure")
+LAWS = ("arc", "arc_eso", "smc", "pid", "pid_eso", "pressure", "pressure_eso")
 
 # Payload and contact come and go; sensors lie, freeze and fall silent for less than their budgets; frames to the driver are lost
 # for longer than its watchdog waits, once for good; all while the controller tracks. Bit rates and clocks are not the defaults.
@@ -78,7 +78,7 @@ modes = "{modes}"
 
 def eventful(base, *, law="arc", layer="rig", seed=5, seconds=2.6):
     """The bench file's text without its name; `seconds` are armed, and shortly before their end the driver hears no more."""
-    trajectory = "excitation_1hz" if law == "pressure" else "t2"
+    trajectory = {"pressure": "excitation_1hz", "pressure_eso": "excitation_1hz"}.get(law, "t2")
     modes = "latched" if law.endswith("_eso") else "flow"
     return EVENTFUL.format(
         base=base, law=law, layer=layer, seed=seed, seconds=seconds, trajectory=trajectory, modes=modes, lost_s=seconds + 0.2

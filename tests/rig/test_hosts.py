@@ -72,9 +72,11 @@ def is_back(bench, names, patience_s=30.0):
     """Wait until all processes are alive and each steady channel has a new sample; returns how long that took, s."""
     began = time.monotonic()
     with open_wire(bench.zenoh, bench.name, "witness") as wire:
-        newest = {channel.name: wire.latest(channel) for channel in (PRESSURE, INCLINATION, VALVES, CYCLE)}
-        heard = set()
+        newest, heard, anew_s = {}, set(), 0.0
         while time.monotonic() - began < patience_s:
+            if time.monotonic() > anew_s:  # what the witness declares while its link comes up can be lost
+                newest = {channel.name: wire.latest(channel) for channel in (PRESSURE, INCLINATION, VALVES, CYCLE)}
+                anew_s = time.monotonic() + 0.5
             heard |= {name for name, latest in newest.items() if latest.take() is not None}
             if len(heard) == len(newest) and wire.processes_alive(timeout_s=0.2) >= set(names):
                 return time.monotonic() - began
@@ -84,6 +86,7 @@ def is_back(bench, names, patience_s=30.0):
 
 def gate_of(bench, wanted, patience_s=20.0):
     with open_wire(bench.zenoh, bench.name, "witness") as wire:
+        wire.settle(lambda: False)
         latest, end = wire.latest(VALVES), time.monotonic() + patience_s
         while time.monotonic() < end:
             payload = latest.take()

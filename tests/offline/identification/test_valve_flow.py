@@ -49,3 +49,11 @@ def test_too_few_tests_are_refused():
     few = FlowTests(*(np.ones(4) for _ in range(4)))
     with pytest.raises(BadFile, match="4 flow tests"):
         fit_valve(few)
+
+
+def test_what_the_tests_show_has_a_number_and_what_they_do_not_has_none():
+    found = fit_valve(flow_tests((60.0, 100.0, 150.0, 200.0), (0.0,)), 0.8)
+    assert found.rank == 4
+    assert found.shown == ("k_v1_m2_ma", "k_v2_pa", "k_v3_m2_pa", "k_v6_m2")
+    assert found.uncertainty.values == pytest.approx(TRUE[:4], rel=0.03)
+    assert found.uncertainty.covariance.shape == (4, 4)

@@ -1,0 +1,144 @@
+"""The identification of the paper's section 2.1 from two logged experiments, and past it: every model, and what it scores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softloop.dynamics.parameters import load_parameters, shipped
+from softloop.offline.identification.experiments import FAST, excite, halves
+from softloop.offline.identification.fitting import fit_output_error
+from softloop.offline.identification.intervals import Uncertainty, of_fit, of_regression
+from softloop.offline.identification.output_error import Fit, score
+from softloop.offline.identification.regression import as_fit, instrumental_variables, least_squares
+from softloop.offline.identification.series import Series, from_log
+from softloop.offline.identification.structure import LINEAR, PAPER, Structure
+from softloop.offline.run_log import open_run
+from softloop.plant.config import PlantConfig
+from softloop.wire.errors import BadConfig
+
+SLOW = "excitation_05hz"
+PAPER_FITS = {"Data2": 92.8772, "Data3": 90.8123}  # NRMSE fit, %, as printed in section 2.1
+MEMORY = Structure(hysteresis=1, creep=2)  # the structure that is recommended where an actuator remembers
+DATA = ("Data1", "Data2", "Data3")
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Model:
+    """One way to identify, and what it came to.
+
+    Attributes:
+        key, words: its short name, and what it is.
+        fit: the model.
+        sure: how sure its values are; None where that is not asked.
+        scores: NRMSE fit of a free simulation of Data1 (trained), Data2 and Data3, %.
+    """
+
+    key: str
+    words: str
+    fit: Fit
+    sure: Uncertainty | None
+    scores: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Identified:
+    """All models of one pair of experiments; `series` are Data1 to Data3."""
+
+    series: tuple[Series, Series, Series]
+    models: tuple[Model, ...]
+    left_out: tuple[str, ...]
+
+    def model(self, key: str) -> Model:
+        return next(m for m in self.models if m.key == key)
+
+
+def data_of(fast: Path, slow: Path) -> tuple[Series, Series, Series]:
+    """Data1, Data2 and Data3 from the runs of the two multi-sines. Raises BadFile."""
+    first, second = halves(from_log(open_run(fast), "Data1"))
+    third = from_log(open_run(slow), "Data3")
+    return first, second, third
+
+
+def identify_all(series: tuple[Series, Series, Series], progress: Progress, only: str = "") -> Identified:
+    """Every model (or the one of the key `only`), trained on Data1. A method that finds no model is left out with a word."""
+    found: list[Model] = []
+    left_out: list[str] = []
+    methods = [m for m in _METHODS if only in ("", m[0])]
+    for done, (key, words, make) in enumerate(methods):
+        progress(done, len(methods))
+        try:
+            fit, sure = make(series[0])
+        except (BadConfig, np.linalg.LinAlgError) as error:
+            left_out.append(f"{words}: {error}")
+            continue
+        scores = dict(zip(DATA, (score(fit, s) for s in series), strict=True))
+        found.append(Model(key, words, fit, sure, scores))
+    progress(len(methods), len(methods))
+    return Identified(series, tuple(found), tuple(left_out))
+
+
+def _ls(train: Series) -> tuple[Fit, Uncertainty]:
+    found = least_squares(PAPER, train)
+    return as_fit(found, train), of_regression(found, "coloured")
+
+
+def _ls_white(train: Series) -> tuple[Fit, Uncertainty]:
+    found = least_squares(PAPER, train)
+    return as_fit(found, train), of_regression(found, "white")
+
+
+def _iv(train: Series) -> tuple[Fit, Uncertainty]:
+    found = instrumental_variables(PAPER, train, fit_output_error(PAPER, [train]).values[:-2])
+    return as_fit(found, train), of_regression(found, "coloured")
+
+
+def _oe(train: Series) -> tuple[Fit, Uncertainty]:
+    fit = fit_output_error(PAPER, [train])
+    return fit, of_fit(fit, [train], "bootstrap")
+
+
+def _linear(train: Series) -> tuple[Fit, None]:
+    return fit_output_error(LINEAR, [train]), None
+
+
+def _memory(train: Series) -> tuple[Fit, None]:
+    return fit_output_error(MEMORY, [train]), None
+
+
+_METHODS: tuple[tuple[str, str, Callable[[Series], tuple[Fit, Uncertainty | None]]], ...] = (
+    ("linear", "linear model, Eq. 1", _linear),
+    ("ls_white", "Eq. 2 by least squares, Eqs. 6 to 10, intervals for white residuals (as the paper)", _ls_white),
+    ("ls", "Eq. 2 by least squares, intervals for coloured residuals", _ls),
+    ("iv", "Eq. 2 by instrumental variables", _iv),
+    ("oe", "Eq. 2 by output error, intervals by block bootstrap", _oe),
+    ("memory", "Eq. 2 with one Bouc-Wen element and two creep terms, output error", _memory),
+)
+
+
+def table1() -> dict[str, tuple[float, float, float]]:
+    """The paper's Table 1: name -> mean and the ends of its interval."""
+    bending = load_parameters(shipped()).bending
+    entries = {name: getattr(bending, name) for name in PAPER.names}
+    return {name: (e.value, e.min, e.max) for name, e in entries.items()}
+
+
+def fit_over_rigs(seeds: Sequence[int], progress: Progress) -> list[dict[str, Any]]:
+    """Fits on Data2 and Data3 of Eq. 2 alone and with memory, trained on Data1, for rigs drawn by seed; in this process."""
+    found = []
+    for done, seed in enumerate(seeds):
+        progress(done, len(seeds))
+        plant = PlantConfig(layer="rig", seed=seed)
+        data1, data2 = halves(excite(FAST, plant, seed))
+        data3 = excite(SLOW, plant, seed)
+        bare = fit_output_error(PAPER, [data1])
+        fits = {"oe": bare, "memory": fit_output_error(MEMORY, [data1], bare)}
+        scores = {key: {"Data2": score(fit, data2), "Data3": score(fit, data3)} for key, fit in fits.items()}
+        found.append({"seed": seed, **scores})
+    progress(len(seeds), len(seeds))
+    return found
