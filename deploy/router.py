@@ -24,6 +24,7 @@ from softloop.wire.shell import Stop
 
 POLL_S = 0.1
 JOIN_S = 3.0  # joining takes well under a tenth of a second
+ALONE_S = 1.0  # what a router knows comes to a new session within milliseconds, on a busy machine within some tenths of a second
 
 
 @contextmanager
@@ -94,12 +95,18 @@ def _try_to_join(config: ZenohConfig, bench: str, name: str, patience_s: float, 
 
 
 def _be_alone(wire: Wire, where: str, own: set[str] | None) -> None:
-    """See that nobody else is there for this bench, or nobody of this host."""
-    running = wire.processes_alive()
-    if own is not None:
-        running &= own
-    if running:
-        raise Unavailable(f"bench '{wire.bench}' is running already at {where}: {', '.join(sorted(running))}")
+    """See that nobody else is there for this bench, or nobody of this host.
+
+    Asked again for a while: a router that was just joined may answer before it has told who is there.
+    """
+    deadline = time.monotonic() + ALONE_S
+    while time.monotonic() < deadline:
+        running = wire.processes_alive()
+        if own is not None:
+            running &= own
+        if running:
+            raise Unavailable(f"bench '{wire.bench}' is running already at {where}: {', '.join(sorted(running))}")
+        time.sleep(POLL_S)
 
 
 def remove_sockets(bench: Bench, pid: int) -> None:

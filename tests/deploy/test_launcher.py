@@ -188,4 +188,4 @@ def test_a_shared_meeting_point_must_be_there_and_know_nobody_of_the_bench(short
                 pass
         wait_for(lambda: not meeting.processes_alive())
         with launcher_wire(bench) as wire:
-            assert wire.processes_alive() == {"launcher"}
+            wait_for(lambda: wire.processes_alive() == {"launcher"})
