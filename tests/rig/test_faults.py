@@ -96,7 +96,7 @@ def test_the_command_runs_scenarios_and_judges_them(tmp_path):
     answer = json.loads(done.stdout)
     assert answer == json.loads((tmp_path / "out" / "faults.json").read_text())
     dead, killed, other = answer["scenarios"]
-    assert [row["seen"] for row in (dead, killed, other)] == ["DEAD", "VENT", "DEAD"]
+    assert [row["seen"] for row in (dead, killed, other)] == ["DEAD", "VENT", "DEAD"], done.stdout + done.stderr
     assert [row["as_expected"] for row in (dead, killed, other)] == [True, True, False]
     assert (dead["vent_s"], dead["empty_s"]) == (None, None)
     assert dead["chamber_kpa"] > 10.0

@@ -92,7 +92,10 @@ LONG = f'base = "{SIM}"\n[pace]\nmode = "lockstep"\ntimeout_s = 3.0\n'
 
 
 @pytest.mark.rig
-@pytest.mark.parametrize(("process", "number"), [("pressures", signal.SIGKILL), ("inclinometer", signal.SIGSTOP)])
+@pytest.mark.parametrize(
+    ("process", "number"),
+    [("pressures", signal.SIGKILL), pytest.param("inclinometer", signal.SIGSTOP, marks=pytest.mark.long)],
+)
 def test_a_lost_process_ends_it_with_a_word_that_names_it(process, number):
     with running(LONG, name="lost") as rig:
         rig.wait_for_word("gate armed")
@@ -103,6 +106,7 @@ def test_a_lost_process_ends_it_with_a_word_that_names_it(process, number):
 
 
 @pytest.mark.rig
+@pytest.mark.long
 def test_ctrl_c_ends_it():
     with running(LONG, name="interrupted") as rig:
         rig.wait_for_word("gate armed")
