@@ -44,15 +44,21 @@ Kind = Literal[
 ]  # fmt: skip
 
 
-class InjectionConfig(Table):
-    """One thing that goes wrong between devices and processes. Times count from the instant at which the gate is armed."""
+class InjectionFields(Table):
+    """What an injection consists of, in a bench file and in a scenario. Times count from the instant at which the gate is armed."""
 
-    kind: Kind = Field(description="what goes wrong; see docs/faults.md")
+    kind: str = Field(description="what goes wrong; docs/faults.md lists the kinds")
     target: str = Field("", description="where: a wire, a channel, a sensor's value or a process, as docs/faults.md lists them")
     at_s: float = Field(ge=0, description="when it begins")
     duration_s: float = Field(ALWAYS_S, gt=0, description="default: it stays")
     probability: float = Field(1.0, gt=0, le=1, description="how likely each frame, byte, sample or value is hit")
     size: float = Field(0.0, description="delay, step: ms; bias: kPa, deg, deg/s; noise: its deviation; corrupt: bits, 0 is one")
+
+
+class InjectionConfig(InjectionFields):
+    """One thing that goes wrong between devices and processes."""
+
+    kind: Kind = Field(description="what goes wrong; docs/faults.md lists the kinds")
 
     @property
     def family(self) -> str:
