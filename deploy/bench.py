@@ -178,10 +178,24 @@ def _check_together(bench: Bench, source: Source) -> None:
             raise BadConfig(f"{source.origin(where)}: {error}") from None
     if bench.pace.mode == "lockstep":
         _check_lockstep(bench, source)
+    _check_buses(bench, source)
     try:
         check_hosts(bench)
     except BadConfig as error:
         raise BadConfig(f"{source.file}: {error}") from None
+
+
+def _check_buses(bench: Bench, source: Source) -> None:
+    """An emulated bus is held by the plant, so it must be on it. Raises BadConfig."""
+    held = {bench.plant.can_valves, bench.plant.can_analog} if bench.plant is not None else set()
+    emulated = {name for name, bus in bench.can.items() if bus.emulation is not None}
+    for name in sorted(emulated - held):
+        where = f"{source.origin(('can', name, 'emulation'))}: key 'can.{name}.emulation'"
+        raise BadConfig(f"{where}: the simulated rig holds an emulated bus, so [plant] must be on [can.{name}]")
+    names = (getattr(bench.plant, "can_analog", ""), getattr(bench.plant, "can_valves", ""))
+    for injection in bench.faults.injections:
+        if injection.family == "bus" and names[injection.target != "analog"] not in emulated:
+            raise BadConfig(f"{source.file}: key 'faults.injections': kind '{injection.kind}' needs a [can.NAME.emulation]")
 
 
 def _check_lockstep(bench: Bench, source: Source) -> None:

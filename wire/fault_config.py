@@ -16,8 +16,9 @@ ALWAYS_S = 1e9
 LINE_ACTIONS = ("drop", "delay", "duplicate", "reorder", "corrupt")
 # Kinds whose size means something, and what. All others have none; `corrupt` may have one.
 SIZED = {"delay": "ms", "step": "ms", "bias": "kPa, deg or deg/s", "noise": "its standard deviation"}
-# Target -> the process that injects.
+# Target -> the process that injects. A bus in time is the plant's.
 CAN_TARGETS = {"analog": "pressures", "driver": "valves", "command": "valves"}
+BUS_TARGETS = dict.fromkeys(CAN_TARGETS, "plant")
 SERIAL_TARGETS = {"inclinometer": "inclinometer"}
 ZENOH_TARGETS = {"pressure": "pressures", "inclination": "inclinometer", "command": "controller", "valves": "valves"}
 SENSOR_TARGETS = {
@@ -27,6 +28,7 @@ PROCESSES = ("plant", "valves", "pressures", "inclinometer", "controller", "reco
 LAUNCHER = "launcher"
 TARGETS: dict[str, dict[str, str]] = {
     "can": CAN_TARGETS,
+    "bus": BUS_TARGETS,
     "serial": SERIAL_TARGETS,
     "zenoh": ZENOH_TARGETS,
     "sensor": SENSOR_TARGETS,
@@ -37,6 +39,7 @@ TARGETS: dict[str, dict[str, str]] = {
 
 Kind = Literal[
     "can_drop", "can_delay", "can_duplicate", "can_reorder", "can_corrupt", "can_error_frames", "can_bus_off",
+    "bus_disturb",
     "serial_drop", "serial_delay", "serial_duplicate", "serial_reorder", "serial_corrupt",
     "zenoh_drop", "zenoh_delay", "zenoh_duplicate", "zenoh_reorder", "zenoh_corrupt",
     "sensor_stuck", "sensor_bias", "sensor_noise", "sensor_nan",
@@ -45,7 +48,7 @@ Kind = Literal[
 
 
 class InjectionFields(Table):
-    """What an injection consists of, in a bench file and in a scenario. Times count from the instant at which the gate is armed."""
+    """What an injection consists of, in a bench file and in a scenario."""
 
     kind: str = Field(description="what goes wrong; docs/faults.md lists the kinds")
     target: str = Field("", description="where: a wire, a channel, a sensor's value or a process, as docs/faults.md lists them")
@@ -56,13 +59,13 @@ class InjectionFields(Table):
 
 
 class InjectionConfig(InjectionFields):
-    """One thing that goes wrong between devices and processes."""
+    """One thing that goes wrong between devices and processes. Times count from the instant at which the gate is armed."""
 
     kind: Kind = Field(description="what goes wrong; docs/faults.md lists the kinds")
 
     @property
     def family(self) -> str:
-        """What it is done to: can, serial, zenoh, sensor, process, clock, disk."""
+        """What it is done to: can, bus, serial, zenoh, sensor, process, clock, disk."""
         return self.kind.partition("_")[0]
 
     @property
@@ -78,7 +81,7 @@ class InjectionConfig(InjectionFields):
     @property
     def has_chance(self) -> bool:
         """It hits things one by one, each with its probability."""
-        return self.family in ("can", "serial", "zenoh", "sensor")
+        return self.family in ("can", "bus", "serial", "zenoh", "sensor")
 
     @property
     def needs_wall(self) -> bool:
