@@ -7,10 +7,12 @@ what comes of the commands. The gate and the pressure adapter are nodes too, in 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import count
 
 from softloop.devices.protocols.can_frames import ANALOG_INPUTS_ID, DLC, VALVE_COMMAND_ID, VALVE_STATUS_ID
 from softloop.devices.protocols.wire_time import can_frame_ns
+from softloop.wire.can_bits import frame_bits
 from softloop.wire.can_bus import Delivery
 from softloop.wire.can_config import CanConfig
 from softloop.wire.can_frame import FLAG_ERROR, CanFrame, make_frame
@@ -26,8 +28,19 @@ NAMES = DRIVER, ANALOG, GATE, PRESSURES = "driver", "analog", "valves", "pressur
 _SENDERS = {VALVE_STATUS_ID: DRIVER, ANALOG_INPUTS_ID: ANALOG}
 _TARGETS = {VALVE_COMMAND_ID: "command", VALVE_STATUS_ID: "driver", ANALOG_INPUTS_ID: "analog"}
 _HEARERS = {GATE: (WIRE_DRIVER, VALVE_STATUS_ID), PRESSURES: (WIRE_ANALOG, ANALOG_INPUTS_ID)}
+_BABBLE = {"first": 0x000, "last": 0x7FF}  # before all others in arbitration, and behind all
+_BABBLER = 1  # its node
 STATUS_NS = 100_000_000
 _STATUS = message("CanBusStatus")
+
+
+@dataclass
+class _Babbler:
+    """A node that sends without end while its injection stands, and what it sends."""
+
+    strike: Strike
+    frame: CanFrame
+    next_ns: int = 0
 
 
 class BusEnd:
@@ -41,10 +54,16 @@ class BusEnd:
         self._strikes: Mapping[int, list[Strike]] = {i: context.faults.of("bus", name) for i, name in _TARGETS.items()}
         if any(self._strikes.values()):
             self._owner.bus.disturbs = self._disturbs
+        self._babblers = [
+            _Babbler(strike, make_frame(1, 0, _BABBLER, arbitration_id, bytes([0x55] * DLC)))
+            for target, arbitration_id in _BABBLE.items()
+            for strike in context.faults.of("bus", target)
+        ]
         self.commands = context.pace.valve_frames(self._owner, 0)
 
     def _disturbs(self, frame: CanFrame, start_ns: int) -> bool:
-        return any([strike.hits(start_ns) for strike in self._strikes.get(frame.arbitration_id, ())])
+        hit = [strike.hits(start_ns) for strike in self._strikes.get(frame.arbitration_id, ())]  # each has chances of its own
+        return any(hit)
 
     def take(self, now_ns: int) -> None:
         """Take what nodes in other processes have handed over."""
@@ -55,7 +74,8 @@ class BusEnd:
         """Let a device send a frame that on an idle bus would be over at `end_ns` at the latest."""
         name, at_ns = _SENDERS[arbitration_id], end_ns - self._frame_ns
         node = self._owner.nodes[name]
-        self._owner.send(make_frame(next(self._numbers[name]), at_ns, node, arbitration_id, data), at_ns)
+        frame = make_frame(next(self._numbers[name]), at_ns, node, arbitration_id, data)
+        self._owner.send(frame, at_ns, mailbox=True)
 
     @property
     def next_ns(self) -> int:
@@ -65,11 +85,22 @@ class BusEnd:
     def run_until(self, now_ns: int) -> list[CanFrame]:
         """Let all happen that ends by then; gives the frames that have reached the valve driver, each stamped with its end."""
         reached = []
+        self._babble(now_ns)
         for delivery in self._owner.run_until(now_ns):
             self._announce(delivery)
             if delivery.node == self._owner.nodes[DRIVER] and not delivery.own and not delivery.frame.flags & FLAG_ERROR:
                 reached.append(delivery.frame)
         return reached
+
+    def _babble(self, now_ns: int) -> None:
+        """Let a node that has gone mad have a frame ready whenever the last one could be over."""
+        for one in self._babblers:
+            one.next_ns = one.next_ns or now_ns
+            while one.next_ns < now_ns:
+                if one.strike.on(one.next_ns):
+                    one.frame = one.frame._replace(seq=one.frame.seq + 1, stamp_ns=one.next_ns)
+                    self._owner.send(one.frame, one.next_ns)
+                one.next_ns += self._owner.bus.bits_ns(frame_bits(one.frame))
 
     def _announce(self, delivery: Delivery) -> None:
         """Tell the pace of what an adapter is to take."""

@@ -89,17 +89,27 @@ class CanBus:
         of_node = self._nodes[node].counters
         return of_node.transmit, of_node.receive
 
-    def send(self, node: int, frame: CanFrame, now_ns: int) -> bool:
+    def send(self, node: int, frame: CanFrame, now_ns: int, *, mailbox: bool = False) -> bool:
         """Put a frame into a node's queue; False when it is full, or the node is off the bus.
 
         `now_ns` may be ahead of what `run_until` was told, and behind it: then the frame is as late for the bus as it came.
+        With `mailbox` it takes the place of one with its identifier that still waits, as devices that send in cycles do.
         """
         own = self._nodes[node]
         if own.counters.off or len(own.waiting) >= self._queue:
             self.refused += 1
             return False
+        same = mailbox and own.waiting and own.waiting[-1].frame.arbitration_id == frame.arbitration_id
+        if same and (len(own.waiting) > 1 or not self._may_be_under_way(node, now_ns)):
+            own.waiting.pop()
         own.waiting.append(_Waiting(now_ns, frame, frame_bits(frame)))
         return True
+
+    def _may_be_under_way(self, node: int, now_ns: int) -> bool:
+        start_ns = self.next_ns()
+        if start_ns is None or start_ns >= now_ns or self._returning(start_ns) is not None:
+            return False
+        return self._arbitrate(start_ns)[0] == node
 
     def disturb(self, frames: int = 1) -> None:
         """Disturb the next transmissions, whoever sends them."""

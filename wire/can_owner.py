@@ -20,7 +20,7 @@ from softloop.wire.can_config import CanConfig, EmulationConfig
 from softloop.wire.can_errors import ERROR_BUS
 from softloop.wire.can_frame import FLAG_ERROR, FRAME_SIZE, CanFrame, controller_of, unpack_frame
 from softloop.wire.can_queue import FrameQueue
-from softloop.wire.can_zenoh import FramePublisher
+from softloop.wire.can_zenoh import FramePublisher, answer_to, name_key
 from softloop.wire.channels import BUS_ROOT, bus_key, can_key, node_of
 from softloop.wire.messages import message
 from softloop.wire.session import Wire
@@ -61,7 +61,8 @@ class BusOwner:
         self._inbox = FrameQueue(_INBOX)
         self._publisher = FramePublisher(wire.session, wire.bench, self._channel, wire.congestion, can_key)
         handler = zenoh.handlers.Callback(self._receive, indirect=False)
-        self._subscriber = wire.session.declare_subscriber(f"{BUS_ROOT}/{wire.bench}/{self._channel}/*", handler)
+        subscriber = wire.session.declare_subscriber(f"{BUS_ROOT}/{wire.bench}/{self._channel}/*", handler)
+        self._declared = (subscriber, answer_to(wire.session, name_key(wire.bench, self._channel, 0)))
 
     # Runs in Zenoh's receiving thread: short, and never raises.
     def _receive(self, sample: zenoh.Sample) -> None:
@@ -76,15 +77,18 @@ class BusOwner:
         """The next frame that a node of another process has handed over; it is not on the bus before `send`."""
         return self._inbox.take(timeout_s)
 
-    def send(self, frame: CanFrame, at_ns: int) -> bool:
-        """Let the frame's node have it to send from `at_ns` on; False when its queue is full, or it is off the bus."""
+    def send(self, frame: CanFrame, at_ns: int, *, mailbox: bool = False) -> bool:
+        """Let the frame's node have it to send from `at_ns` on; False when its queue is full, or it is off the bus.
+
+        `mailbox`: as `CanBus.send` has it.
+        """
         if frame.node not in self._places:
             if len(self._places) >= _MOST_NODES:  # strangers must not eat the memory
                 self.malformed += 1
                 return False
             self.bus.join(frame.node)
             self._places.append(frame.node)
-        return self.bus.send(frame.node, frame, at_ns)
+        return self.bus.send(frame.node, frame, at_ns, mailbox=mailbox)
 
     def next_ns(self) -> int:
         """When the next thing on the bus is over, as far as is known."""
@@ -125,7 +129,8 @@ class BusOwner:
         """Let go of the channel."""
         self._publisher.close()
         self._inbox.close()
-        self._subscriber.undeclare()
+        for declared in self._declared:
+            declared.undeclare()
 
 
 def _filled(values: list[int]) -> list[int]:

@@ -4,8 +4,8 @@
 Each frame is a `CanFrame` message on a key of its own, `softloop/<bench>/can/<channel>/<id>`. There is no arbitration, no
 bit time and no acknowledgement: what is sent arrives at once at all other buses of the channel, or, when a reader stalls,
 is dropped and never waited for. With `through_bus` it goes to the one who holds the channel as a bus in time (`can_owner`)
-instead, comes to all others from there, and error frames are heard that are this node's own. `bus.lost` counts the gaps in the senders' counters, `bus.dropped` what found this bus's
-own queue full, `bus.malformed` what came on the keys and was no frame.
+instead, comes to all others from there, and error frames are heard that are this node's own. `bus.lost` counts the gaps in
+the senders' counters, `bus.dropped` what found this bus's own queue full, `bus.malformed` what came on the keys and was no frame.
 """
 
 from __future__ import annotations
@@ -172,11 +172,11 @@ class ZenohBus(can.BusABC):
         self._key_head = head
         key_of = bus_key if self._through_bus else can_key
         self._publisher = FramePublisher(session, self._bench, self._channel, self._congestion, key_of)
-        self._name_key = f"{ROOT}/{self._bench}/buses/{self._channel}/{self._node:x}"
+        self._name_key = name_key(self._bench, self._channel, self._node)
         try:
             handler = zenoh.handlers.Callback(self._receive, indirect=False)
             self._subscriber = session.declare_subscriber(head + "*", handler)
-            self._answers = session.declare_queryable(self._name_key, zenoh.handlers.Callback(self._answer, indirect=False))
+            self._answers = answer_to(session, self._name_key)
             # An answer comes after its sender knows of this subscription: from now on no frame passes it by.
             _buses_there(session, self._bench, self._channel)
         except zenoh.ZError as error:
@@ -205,10 +205,6 @@ class ZenohBus(can.BusABC):
             return
         if self._wanted(frame):
             self._queue.put(frame)
-
-    def _answer(self, query: zenoh.Query) -> None:
-        with query, contextlib.suppress(zenoh.ZError):
-            query.reply(self._name_key, b"")
 
     def _count_lost(self, frame: CanFrame) -> None:
         with self._counting:
@@ -296,6 +292,21 @@ class ZenohBus(can.BusABC):
         """The channels in use on the default bench, or `can0` when there is none."""
         channels = _channels_in_use(DEFAULT_BENCH, default_endpoint(DEFAULT_BENCH)) or {"can0"}
         return [{"interface": "zenoh", "channel": name} for name in sorted(channels)]
+
+
+def name_key(bench: str, channel: str, node: int) -> str:
+    """The key on which a bus object answers that it is there; 0 is the number of who holds an emulated bus."""
+    return f"{ROOT}/{bench}/buses/{channel}/{node:x}"
+
+
+def answer_to(session: zenoh.Session, own_key: str) -> Any:
+    """Answer whoever asks for the buses that are there: it then knows of the subscriptions declared before."""
+
+    def answer(query: zenoh.Query) -> None:
+        with query, contextlib.suppress(zenoh.ZError):
+            query.reply(own_key, b"")
+
+    return session.declare_queryable(own_key, zenoh.handlers.Callback(answer, indirect=False))
 
 
 def random_node() -> int:

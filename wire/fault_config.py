@@ -18,7 +18,8 @@ LINE_ACTIONS = ("drop", "delay", "duplicate", "reorder", "corrupt")
 SIZED = {"delay": "ms", "step": "ms", "bias": "kPa, deg or deg/s", "noise": "its standard deviation"}
 # Target -> the process that injects. A bus in time is the plant's.
 CAN_TARGETS = {"analog": "pressures", "driver": "valves", "command": "valves"}
-BUS_TARGETS = dict.fromkeys(CAN_TARGETS, "plant")
+BABBLE_TARGETS = ("first", "last")  # in arbitration
+BUS_TARGETS = dict.fromkeys((*CAN_TARGETS, *BABBLE_TARGETS), "plant")
 SERIAL_TARGETS = {"inclinometer": "inclinometer"}
 ZENOH_TARGETS = {"pressure": "pressures", "inclination": "inclinometer", "command": "controller", "valves": "valves"}
 SENSOR_TARGETS = {
@@ -39,7 +40,7 @@ TARGETS: dict[str, dict[str, str]] = {
 
 Kind = Literal[
     "can_drop", "can_delay", "can_duplicate", "can_reorder", "can_corrupt", "can_error_frames", "can_bus_off",
-    "bus_disturb",
+    "bus_disturb", "bus_babble",
     "serial_drop", "serial_delay", "serial_duplicate", "serial_reorder", "serial_corrupt",
     "zenoh_drop", "zenoh_delay", "zenoh_duplicate", "zenoh_reorder", "zenoh_corrupt",
     "sensor_stuck", "sensor_bias", "sensor_noise", "sensor_nan",
@@ -81,7 +82,7 @@ class InjectionConfig(InjectionFields):
     @property
     def has_chance(self) -> bool:
         """It hits things one by one, each with its probability."""
-        return self.family in ("can", "bus", "serial", "zenoh", "sensor")
+        return self.family in ("can", "serial", "zenoh", "sensor") or self.kind == "bus_disturb"
 
     @property
     def needs_wall(self) -> bool:
@@ -93,6 +94,9 @@ class InjectionConfig(InjectionFields):
         allowed = TARGETS[self.family]
         if self.target not in allowed:
             names = ", ".join(name for name in allowed if name) or "(none)"
+            raise ValueError(f"kind '{self.kind}' has no target '{self.target}'; it has: {names}")
+        if self.family == "bus" and (self.target in BABBLE_TARGETS) != (self.action == "babble"):
+            names = ", ".join(BABBLE_TARGETS if self.action == "babble" else CAN_TARGETS)
             raise ValueError(f"kind '{self.kind}' has no target '{self.target}'; it has: {names}")
         if self.target == "command" and self.action in ("error_frames", "bus_off"):
             raise ValueError(f"kind '{self.kind}' has no target 'command'; a node's trouble is that of target 'driver'")
