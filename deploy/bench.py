@@ -21,7 +21,7 @@ from softloop.controller.config import ControllerConfig
 from softloop.deploy.config import CalibrationConfig, MachineConfig, RunConfig
 from softloop.deploy.hosts import check_hosts
 from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig, pressures_process, valves_process
-from softloop.plant.config import PlantConfig, plant_process
+from softloop.plant.config import PlantConfig, emulated_buses, plant_process
 from softloop.watch.config import FoxgloveConfig, LawGains, MonitorConfig, MonitorProcess, PageConfig, RecorderConfig
 from softloop.wire.benchfile import Table, load_model, read_toml, validated
 from softloop.wire.can_config import CanConfig
@@ -178,10 +178,28 @@ def _check_together(bench: Bench, source: Source) -> None:
             raise BadConfig(f"{source.origin(where)}: {error}") from None
     if bench.pace.mode == "lockstep":
         _check_lockstep(bench, source)
+    _check_buses(bench, source)
     try:
         check_hosts(bench)
     except BadConfig as error:
         raise BadConfig(f"{source.file}: {error}") from None
+
+
+def _check_buses(bench: Bench, source: Source) -> None:
+    """An emulated bus is held by the plant, so it must be on it. Raises BadConfig."""
+    emulated = emulated_buses(bench.plant, bench.can) if bench.plant is not None else ()
+    for name in sorted({name for name, bus in bench.can.items() if bus.emulation is not None} - {*emulated}):
+        where = f"{source.origin(('can', name, 'emulation'))}: key 'can.{name}.emulation'"
+        raise BadConfig(f"{where}: the simulated rig holds an emulated bus, so [plant] must be on [can.{name}]")
+    if emulated and bench.zenoh.tls is not None:
+        raise BadConfig(
+            f"{source.file}: key 'can': on a secured bench the gate alone may put valve frames on the wire, so a bus "
+            "that the simulated rig holds cannot carry them; leave out [can.NAME.emulation]"
+        )
+    names = (getattr(bench.plant, "can_analog", ""), getattr(bench.plant, "can_valves", ""))
+    for injection in bench.faults.injections:
+        if injection.family == "bus" and names[injection.target != "analog"] not in emulated:
+            raise BadConfig(f"{source.file}: key 'faults.injections': kind '{injection.kind}' needs a [can.NAME.emulation]")
 
 
 def _check_lockstep(bench: Bench, source: Source) -> None:
@@ -196,6 +214,9 @@ def _check_lockstep(bench: Bench, source: Source) -> None:
     late = next((i.kind for i in bench.faults.injections if i.needs_wall), None)
     if late is not None:
         raise BadConfig(f"{source.file}: key 'faults.injections': kind '{late}' needs wall pace")
+    talking = next((name for name, bus in bench.can.items() if bus.emulation is not None and bus.emulation.bus_errors), None)
+    if talking is not None:
+        raise BadConfig(f"{source.file}: key 'can.{talking}.emulation.bus_errors': must be false at lockstep pace")
     if bench.inclinometer is not None and bench.inclinometer.configure:
         raise BadConfig(f"{source.file}: key 'inclinometer.configure': must be false at lockstep pace")
 

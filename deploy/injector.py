@@ -65,27 +65,28 @@ class Injector:
         return None if child is None or child.exit_code() is not None else child
 
     def _begin(self, injection: InjectionConfig) -> None:
-        child = self._alive(injection)
-        if child is None:
-            return
-        if injection.kind == "process_stop":
-            child.popen.send_signal(signal.SIGSTOP)
-        elif injection.kind == "disk_full":
-            _limit_files(child, self._log.stat().st_size if self._log.is_file() else 0)
-        else:
+        if not self._set(injection, on=True):
+            child = self._children.all[injection.target]
             child.popen.kill()
             child.popen.wait()
             if injection.kind == "process_restart":
                 self._start(injection.target)
 
     def _end(self, injection: InjectionConfig) -> None:
-        child = self._alive(injection)
-        if child is None:
-            return
+        if self._alive(injection) is not None:
+            self._set(injection, on=False)
+
+    def _set(self, injection: InjectionConfig, *, on: bool) -> bool:
+        """Begin or end what stands for a while; False for a kind that is done once and for all."""
+        child = self._children.all[injection.target]
         if injection.kind == "process_stop":
-            child.popen.send_signal(signal.SIGCONT)
+            child.popen.send_signal(signal.SIGSTOP if on else signal.SIGCONT)
         elif injection.kind == "disk_full":
-            _limit_files(child, resource.RLIM_INFINITY)
+            size = self._log.stat().st_size if self._log.is_file() else 0
+            _limit_files(child, size if on else resource.RLIM_INFINITY)
+        else:
+            return False
+        return True
 
 
 def _limit_files(child: Child, size: int) -> None:

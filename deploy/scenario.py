@@ -13,22 +13,15 @@ from softloop.deploy.bench import Bench, find_bench, read_source
 from softloop.plant.config import FaultConfig
 from softloop.wire.benchfile import Table, load_model, read_toml
 from softloop.wire.errors import BadConfig, BadFile
-from softloop.wire.fault_config import ALWAYS_S, InjectionConfig, Kind
+from softloop.wire.fault_config import InjectionConfig, InjectionFields, Kind
 
 PLANT_KINDS: tuple[str, ...] = get_args(FaultConfig.model_fields["kind"].annotation)
 HOST_KINDS: tuple[str, ...] = get_args(Kind)
 NAME = r"^[a-z0-9_-]{1,40}$"
 
 
-class ScenarioInjection(Table):
-    """One thing that goes wrong. Times count from the instant at which the gate is armed."""
-
-    kind: str = Field(description="what goes wrong; docs/faults.md lists them")
-    target: str = Field("", description="where, for kinds on the host's side")
-    at_s: float = Field(ge=0, description="when it begins")
-    duration_s: float = Field(ALWAYS_S, gt=0, description="default: it stays")
-    probability: float = Field(1.0, gt=0, le=1, description="how likely each frame, byte, sample or value is hit")
-    size: float = Field(0.0, description="how much, for kinds that have a size")
+class ScenarioInjection(InjectionFields):
+    """One thing that goes wrong, on the host's side or in the simulated rig."""
 
     @property
     def in_plant(self) -> bool:

@@ -15,6 +15,7 @@ from softloop.deploy.bench import Bench, find_bench, load_bench
 from softloop.deploy.launcher import stop_on_signals
 from softloop.deploy.node import PROCESSES
 from softloop.devices.protocols.wire_time import can_frame_ns
+from softloop.plant.config import emulated_buses
 from softloop.watch.echo import choose, writer
 from softloop.watch.guest import guest_wire
 from softloop.watch.overview import Overview
@@ -36,8 +37,10 @@ def overview_of(bench: Bench) -> Overview:
     """An empty overview of a bench, with the names of its processes and the bit rates of its buses."""
     processes = {constant("Event", p.source): p.name for p in PROCESSES}
     # A bus on Zenoh goes by its channel there, any other by its name in the bench file.
-    bitrates = {str(bus.channel) if bus.interface == "zenoh" else name: bus.bitrate for name, bus in bench.can.items()}
-    return Overview(bench.name, bitrates, processes, can_frame_ns)
+    names = {name: str(bus.channel) if bus.interface == "zenoh" else name for name, bus in bench.can.items()}
+    bitrates = {names[name]: bus.bitrate for name, bus in bench.can.items()}
+    held = emulated_buses(bench.plant, bench.can) if bench.plant is not None else ()
+    return Overview(bench.name, bitrates, processes, can_frame_ns, emulated=[names[name] for name in held])
 
 
 def top(bench_file: Path, seconds: float | None, *, once: bool) -> int:

@@ -34,6 +34,7 @@ from softloop.plant.records import EVENT
 from softloop.plant.setup import WireTimes, new_device, new_state, plant_record
 from softloop.wire.can_config import CanConfig
 from softloop.wire.config import PaceConfig
+from softloop.wire.errors import BadConfig
 from softloop.wire.kernel import new_record
 from softloop.wire.messages import names_of
 from softloop.wire.schedule import PERIOD_NS, START_NS, Schedule, make_schedule
@@ -159,10 +160,15 @@ def simulate_trace(tables: RigTables, schedule: Schedule, built: Controller | No
 
 def link_record(tables: RigTables, params: Any, schedule: Schedule) -> Any:
     """The `LINK` record: what the adapters and the gate know of each other and of their wires."""
+    bus = tables.can[tables.plant.can_valves]
+    if bus.emulation is not None or tables.can[tables.plant.can_analog].emulation is not None:
+        raise BadConfig(
+            "key 'can': a run in one process has no bus to emulate; leave out [can.NAME.emulation], or run its processes"
+        )
     link, inclinometer = new_record(LINK), tables.inclinometer
     link.latency_ns = 1000 * tables.pace.software_latency_us
     link.driver_frame_ns, link.analog_frame_ns = params.electrical.driver_frame_ns, params.electrical.analog_frame_ns
-    link.valve_frame_ns = can_frame_ns(ANALOG_DLC, tables.can[tables.plant.can_valves].bitrate)
+    link.valve_frame_ns = can_frame_ns(ANALOG_DLC, bus.bitrate)
     link.sample_bytes_ns = serial_ns(SAMPLE_BYTES, inclinometer.baud)
     link.arm_ns, link.disarm_ns = schedule.arm_ns, schedule.disarm_ns
     link.direction, link.zero_deg = inclinometer.direction, inclinometer.zero_deg

@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softloop.offline.log import Log
+from softloop.plant.truth import CHARGE_OFF_MA, EMPTY_KPA, EXHAUST_OPEN_MM2
 from softloop.wire.messages import constant
 
 Records = NDArray[Any]
 VENT, DEAD, CONTINUE, TRAPPED, NONE = "VENT", "DEAD", "CONTINUE", "TRAPPED", "NONE"
-CHARGE_OFF_MA = 1.0
-EXHAUST_OPEN_MM2 = 0.05
-EMPTY_KPA = 5.0
+GAP_NS = 50_000_000  # the truth comes every 5 ms
 STEADY_NS = 100_000_000  # an exhaust that is open for less is one that is closing
 _KIND_GATE, _KIND_FAULT = constant("Event", "KIND_GATE"), constant("Event", "KIND_FAULT")
 _ARMED, _DRIVER_OK = constant("ValveStatus", "GATE_ARMED"), constant("ValveStatus", "DRIVER_OK")
@@ -57,9 +56,48 @@ def outcome_of(log: Log, armed_s: float) -> SafeOutcome | None:
     if not len(came) or not len(armed) or not len(truth):
         return None
     end_ns = int(armed["stamp_ns"].min()) + round(armed_s * 1e9)
+    stayed = _last_word_of_gate(events, log["valves"], end_ns) == _ARMED
+    return judge(bridged(truth), int(came["stamp_ns"].min()), end_ns, stayed_armed=stayed)
+
+
+def _last_word_of_gate(events: Records, statuses: Records, end_ns: int) -> int | None:
+    """The gate's state before `end_ns`, by its event or its status, whichever is newer: either may have been lost."""
     gates = events[(events["kind"] == _KIND_GATE) & (events["stamp_ns"] < end_ns)]
-    stayed = bool(len(gates)) and gates["code"][np.argmax(gates["stamp_ns"])] == _ARMED
-    return judge(truth, int(came["stamp_ns"].min()), end_ns, stayed_armed=stayed)
+    words = [(int(e["stamp_ns"]), 1, int(e["code"])) for e in gates]
+    said = statuses[statuses["stamp_ns"] < end_ns]
+    if len(said):
+        newest = said[np.argmax(said["stamp_ns"])]
+        words.append((int(newest["stamp_ns"]), 0, int(newest["gate"])))
+    return max(words)[2] if words else None
+
+
+def bridged(truth: Records) -> Records:
+    """The truth, with up to two more records in each gap: when the vent began, and when the chamber was empty.
+
+    A recorder behind a network that was lost heard nothing meanwhile; what it hears next says since when both hold.
+    """
+    gaps = np.flatnonzero(np.diff(truth["stamp_ns"]) > GAP_NS)
+    pieces, start = [], 0
+    for place in gaps.tolist():
+        pieces += [truth[start : place + 1], _in_gap(truth[place : place + 1], truth[place + 1 : place + 2])]
+        start = place + 1
+    return np.concatenate([*pieces, truth[start:]])
+
+
+def _in_gap(before: Records, after: Records) -> Records:
+    """The records, shape (n,) with n from 0 to 2, between two of shape (1,) of which the latter comes late."""
+    vent_ns = max(int(after["charge_off_ns"][0]), int(after["exhaust_open_ns"][0]))
+    empty_ns = int(after["empty_ns"][0])
+    if not after["charge_off_ns"][0] or not after["exhaust_open_ns"][0]:
+        return after[:0]
+    made = []
+    for at_ns in sorted({vent_ns, empty_ns}):
+        if before["stamp_ns"][0] < at_ns < after["stamp_ns"][0]:
+            made.append(after.copy())
+            made[-1]["stamp_ns"] = at_ns
+            if not 0 < empty_ns <= at_ns:
+                made[-1]["chamber_pressure_kpa"] = before["chamber_pressure_kpa"]
+    return np.concatenate(made) if made else after[:0]
 
 
 def judge(truth: Records, began_ns: int, end_ns: int, *, stayed_armed: bool) -> SafeOutcome:

@@ -129,6 +129,12 @@ class PlantProcess:
     analog_bus: CanConfig
 
 
+def emulated_buses(plant: PlantConfig, buses: Mapping[str, CanConfig]) -> tuple[str, ...]:
+    """The names of the emulated buses that the plant holds, in the order of `CanBusStatus.bus`."""
+    held = dict.fromkeys((plant.can_valves, plant.can_analog))
+    return tuple(name for name in held if name in buses and buses[name].emulation is not None)
+
+
 def plant_process(plant: PlantConfig, buses: Mapping[str, CanConfig]) -> PlantProcess:
     """The config of `plant` with its buses. Raises BadConfig on an unknown bus."""
     for key in ("can_valves", "can_analog"):

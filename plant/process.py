@@ -70,13 +70,13 @@ class Plant:
 
     def turn(self) -> None:
         """Read, update, write, keep time."""
-        self._can.take_commands(self._params, self._state)
+        self._can.take_commands(self._params, self._state, self._clock.now_ns())
         self._injection.take(self._params, self._state)
         late_ns = max(self._let_happen(self._clock.now_ns()), self._send_due(self._clock.now_ns()))
         self._late_max_ns = max(self._late_max_ns, late_ns)
         self._misses += late_ns > LATE_NS
         self._status.cycle(late_ns)
-        self._clock.sleep_until_ns(min(self._next_ns, self._outbox.next_ns))
+        self._clock.sleep_until_ns(min(self._next_ns, self._outbox.next_ns, self._can.next_ns))
 
     def close(self) -> None:
         self._serial.close()
@@ -86,10 +86,14 @@ class Plant:
     def _let_happen(self, now_ns: int) -> int:
         """Bring the rig to `now_ns`; returns how late the first happening was noticed."""
         late_ns = self._pace.lateness_ns(self._next_ns)
+        self._can.move(self._params, self._state)
         while self._state["reached_ns"] < now_ns:
-            count = run_until(self._params, self._state, now_ns, self._events)
+            # What comes of a frame on a bus in time comes at its end: no further than to the next one.
+            to_ns = max(min(now_ns, self._can.next_ns), int(self._state["reached_ns"]) + 1)
+            count = run_until(self._params, self._state, to_ns, self._events)
             for kind, sample_ns, end_ns, raw, value in self._events[:count].tolist():
                 self._take(kind, sample_ns, end_ns, raw.tolist(), value)
+            self._can.move(self._params, self._state)
         self._next_ns = int(next_event_ns(self._params, self._state))
         return late_ns
 
@@ -104,7 +108,7 @@ class Plant:
             self._reporter.say(KIND_FAULT, sample_ns, code=raw[0], reason=raw[1], value=value)
         elif kind == EVENT_DRIVER:
             self._reporter.say(KIND_DRIVER, sample_ns, code=raw[0])
-        else:
+        elif not self._can.hand_over(kind, raw, end_ns):
             self._outbox.add(end_ns, kind, raw)
 
     def _await_arming(self) -> None:

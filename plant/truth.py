@@ -25,6 +25,8 @@ from softloop.wire.kernel import kernel
 
 _MM2 = 1e6
 _PA = 1000.0
+# What counts as no current, an open exhaust and an empty chamber.
+CHARGE_OFF_MA, EXHAUST_OPEN_MM2, EMPTY_KPA = 1.0, 0.05, 5.0
 
 
 @kernel(types.void(PLANT_TYPE, STATE_TYPE))
@@ -38,6 +40,23 @@ def _note_areas(params: Any, state: Any) -> None:
     truth.charge_area_mm2, truth.exhaust_area_mm2 = _MM2 * area_in, _MM2 * area_out
 
 
+@kernel(types.i8(types.b1, types.i8, types.i8))
+def _since(holds: bool, before_ns: int, now_ns: int) -> int:
+    """Since when something holds, 0 while it does not; `before_ns` is what this was at the last truth."""
+    if not holds:
+        return 0
+    return before_ns if before_ns != 0 else now_ns
+
+
+@kernel(types.void(STATE_TYPE))
+def _note_since(state: Any) -> None:
+    """A log that heard nothing for a while knows by this when it began."""
+    truth = state.truth
+    truth.charge_off_ns = _since(truth.charge_coil_ma < CHARGE_OFF_MA, truth.charge_off_ns, truth.stamp_ns)
+    truth.exhaust_open_ns = _since(truth.exhaust_area_mm2 > EXHAUST_OPEN_MM2, truth.exhaust_open_ns, truth.stamp_ns)
+    truth.empty_ns = _since(truth.chamber_pressure_kpa < EMPTY_KPA, truth.empty_ns, truth.stamp_ns)
+
+
 @kernel(types.void(PLANT_TYPE, STATE_TYPE))
 def note_truth(params: Any, state: Any) -> None:
     """Fill `state.truth` for `state.t_ns`; the process adds deadline misses and lateness."""
@@ -48,6 +67,7 @@ def note_truth(params: Any, state: Any) -> None:
     truth.chamber_pressure_kpa, truth.supply_pressure_kpa = x[CHAMBER], x[SUPPLY]
     truth.charge_coil_ma, truth.exhaust_coil_ma = state.coil_charge_ma, state.coil_exhaust_ma
     _note_areas(params, state)
+    _note_since(state)
     truth.gas_temperature_k = x[GAS_K]
     truth.hysteresis_deg_s2, truth.creep_deg_s2 = 0.0, 0.0
     if mechanics.memory:

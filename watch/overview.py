@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softloop.wire.channels import CAN, CYCLE, EVENT, PRESSURE, STATUS, VALVES, WATERMARK, Channel, channel_of_key
-from softloop.wire.messages import BadPayload, constant, message
+from softloop.wire.channels import CAN, CAN_BUS, CYCLE, EVENT, PRESSURE, STATUS, VALVES, WATERMARK, Channel, channel_of_key
+from softloop.wire.messages import BadPayload, constant, message, names_of
 
 RATE_WINDOW_S = 2.0
 LATE_TICKS = 12_000  # a minute
@@ -20,6 +20,8 @@ RECENT_TICKS = 2_000  # ten seconds
 LATE_EDGES_US = np.concatenate([[0.0], np.geomspace(10.0, 100_000.0, 25), [np.inf]])  # six bins a decade, 10 us to 100 ms
 _PLANT, _KIND_FAULT = constant("Event", "SOURCE_PLANT"), constant("Event", "KIND_FAULT")
 _STARTING = constant("ProcessStatus", "STATE_STARTING")
+_NODES = {number: name.replace("_", " ") for number, name in names_of("CanBusStatus", "NODE_").items()}
+_BUS_STATES = {number: name.replace("_", " ") for number, name in names_of("CanBusStatus", "STATE_").items()}
 _KEPT = {CYCLE.name, VALVES.name, PRESSURE.name}
 FrameTime = Callable[[int, int], int]  # data bytes, bit/s -> ns on the bus
 
@@ -58,18 +60,41 @@ class Lane:
 
 @dataclass
 class Bus:
-    """A CAN bus: how long its frames stood on it."""
+    """A CAN bus: how long its frames stood on it, and of an emulated one what it says of itself (`CanBusStatus`)."""
 
     bitrate: int
+    status: Any = None
     busy_ns: int = 0
     marks: deque[tuple[float, int]] = field(default_factory=deque)
 
     @property
     def load_percent(self) -> float:
-        """Share of time taken by frames, each at its longest stuffing, over the last `RATE_WINDOW_S`."""
+        """Share of time taken by frames, each at its longest stuffing, over the last `RATE_WINDOW_S`.
+
+        Of an emulated bus, what that counts: exact lengths and error frames, over its last second.
+        """
+        if self.status is not None:
+            return float(100.0 * self.status.load)
         if len(self.marks) < 2 or self.marks[-1][0] <= self.marks[0][0]:
             return 0.0
         return (self.marks[-1][1] - self.marks[0][1]) * 1e-7 / (self.marks[-1][0] - self.marks[0][0])
+
+    @property
+    def words(self) -> str:
+        """What else an emulated bus says: its nodes that are not well, what was destroyed, how long frames waited."""
+        if self.status is None:
+            return ""
+        told = self.status
+        places = range(min(told.nodes, len(told.state)))
+        counts = [f"{told.transmit_errors[k]}/{told.receive_errors[k]}" for k in places]
+        ill = [
+            f"{_NODES.get(k, f'node {k}')} {_BUS_STATES.get(told.state[k], told.state[k])} ({counts[k]})"
+            for k in places
+            if told.state[k]
+        ]
+        disturbed = [f"{told.disturbed} disturbed"] if told.disturbed else []
+        refused = [f"{told.refused} refused"] if told.refused else []
+        return ", ".join([*ill, *disturbed, *refused, f"waited {told.waited_max_ns * 1e-6:.2f} ms at most"])
 
     def mark(self, now_s: float) -> None:
         self.marks.append((now_s, self.busy_ns))
@@ -91,8 +116,16 @@ class Overview:
     """
 
     def __init__(
-        self, bench: str, bitrates: Mapping[str, int], processes: Mapping[int, str], frame_ns: FrameTime, events_kept: int = 200
+        self,
+        bench: str,
+        bitrates: Mapping[str, int],
+        processes: Mapping[int, str],
+        frame_ns: FrameTime,
+        events_kept: int = 200,
+        emulated: Sequence[str] = (),
     ) -> None:
+        """`emulated`: the buses' names in the order of `CanBusStatus.bus`."""
+        self._emulated = emulated
         self._bench = bench
         self._processes = processes
         self._frame_ns = frame_ns
@@ -153,6 +186,8 @@ class Overview:
             self.cycles.append(unpacked)
         elif lane.channel is CAN:
             self._note_frame(full_key.split("/")[3], unpacked)
+        elif lane.channel is CAN_BUS and unpacked.bus < len(self._emulated):
+            self.buses[self._emulated[unpacked.bus]].status = unpacked
         elif lane.channel is STATUS:
             name = self._processes.get(unpacked.process, f"process {unpacked.process}")
             self.statuses[name] = (unpacked, now_s)

@@ -87,9 +87,9 @@ def _is_slow(lane: Lane, declared_hz: float, now_s: float) -> bool:
 
 
 def _buses(overview: Overview) -> Table:
-    table = _table("CAN bus", ("load (%)", "bit/s"))
+    table = _table("CAN bus", ("load (%)", "bit/s", "emulated"))
     for name, bus in overview.buses.items():
-        table.add_row(name, f"{bus.load_percent:.1f}", str(bus.bitrate))
+        table.add_row(name, f"{bus.load_percent:.1f}", str(bus.bitrate), bus.words)
     return table
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import random
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -31,10 +32,18 @@ class Delivery(NamedTuple):
     own: bool
 
 
+class _Waiting(NamedTuple):
+    """A frame in its node's queue: since when, and how long it will stand on the bus."""
+
+    since_ns: int
+    frame: CanFrame
+    bits: int
+
+
 @dataclass
 class _Node:
     counters: ErrorCounters = field(default_factory=ErrorCounters)
-    waiting: deque[tuple[int, CanFrame]] = field(default_factory=deque)  # (since when, frame)
+    waiting: deque[_Waiting] = field(default_factory=deque)
     may_send_ns: int = 0
     recovers_ns: int = 0  # 0: not on its way back
     said: NodeState = NodeState.ACTIVE
@@ -45,7 +54,10 @@ class CanBus:
     """One bus and its nodes.
 
     Attributes:
-        frames, disturbed, unacknowledged: how often each happened, in total.
+        frames, disturbed, unacknowledged, refused: how often each happened, in total; refused frames found their node's
+            queue full, or the node off the bus.
+        waited_max_ns: the longest that a frame which got out had waited for its turn; whoever reads it sets it back.
+        disturbs: asked of each transmission (frame, its start) whether something destroys it.
     """
 
     def __init__(self, bitrate: int, *, error_rate: float = 0.0, restart_ns: int = 0, queue: int = 64, seed: int = 1) -> None:
@@ -57,7 +69,8 @@ class CanBus:
         self._free_ns = 0
         self._to_disturb = 0
         self._busy: deque[tuple[int, int]] = deque()
-        self.frames = self.disturbed = self.unacknowledged = 0
+        self.frames = self.disturbed = self.unacknowledged = self.refused = self.waited_max_ns = 0
+        self.disturbs: Callable[[CanFrame, int], bool] = lambda frame, start_ns: False
 
     def bits_ns(self, bits: int) -> int:
         return bits * NS // self.bitrate
@@ -76,13 +89,27 @@ class CanBus:
         of_node = self._nodes[node].counters
         return of_node.transmit, of_node.receive
 
-    def send(self, node: int, frame: CanFrame, now_ns: int) -> bool:
-        """Put a frame into a node's queue; False when it is full, or the node is off the bus."""
+    def send(self, node: int, frame: CanFrame, now_ns: int, *, mailbox: bool = False) -> bool:
+        """Put a frame into a node's queue; False when it is full, or the node is off the bus.
+
+        `now_ns` may be ahead of what `run_until` was told, and behind it: then the frame is as late for the bus as it came.
+        With `mailbox` it takes the place of one with its identifier that still waits, as devices that send in cycles do.
+        """
         own = self._nodes[node]
         if own.counters.off or len(own.waiting) >= self._queue:
+            self.refused += 1
             return False
-        own.waiting.append((now_ns, frame))
+        same = mailbox and own.waiting and own.waiting[-1].frame.arbitration_id == frame.arbitration_id
+        if same and (len(own.waiting) > 1 or not self._may_be_under_way(node, now_ns)):
+            own.waiting.pop()
+        own.waiting.append(_Waiting(now_ns, frame, frame_bits(frame)))
         return True
+
+    def _may_be_under_way(self, node: int, now_ns: int) -> bool:
+        start_ns = self.next_ns()
+        if start_ns is None or start_ns >= now_ns or self._returning(start_ns) is not None:
+            return False
+        return self._arbitrate(start_ns)[0] == node
 
     def disturb(self, frames: int = 1) -> None:
         """Disturb the next transmissions, whoever sends them."""
@@ -104,25 +131,37 @@ class CanBus:
     def next_ns(self) -> int | None:
         """When the next frame may begin or a node comes back; None when nothing waits."""
         starts = [
-            max(self._free_ns, n.may_send_ns, n.waiting[0][0]) for n in self._nodes.values() if n.waiting and not n.counters.off
+            max(self._free_ns, n.may_send_ns, n.waiting[0].since_ns)
+            for n in self._nodes.values()
+            if n.waiting and not n.counters.off
         ]
         backs = [n.recovers_ns for n in self._nodes.values() if n.recovers_ns]
         return min(starts + backs, default=None)
+
+    def next_end_ns(self) -> int | None:
+        """When the next thing is over, as far as is known now: a frame, or a node's way back; None when nothing waits."""
+        start_ns = self.next_ns()
+        if start_ns is None or self._returning(start_ns) is not None:
+            return start_ns
+        return start_ns + self.bits_ns(self._arbitrate(start_ns)[1].bits)
 
     def run_until(self, now_ns: int) -> list[Delivery]:
         """Let all happen that ends at or before `now_ns`; what the nodes get, in the order of time."""
         found: list[Delivery] = []
         while (start_ns := self.next_ns()) is not None and start_ns <= now_ns:
-            back = next((k for k, n in self._nodes.items() if n.recovers_ns and n.recovers_ns == start_ns), None)
+            back = self._returning(start_ns)
             if back is not None:
                 found += self._come_back(back, start_ns)
                 continue
-            sender, frame = self._arbitrate(start_ns)
-            end_ns = start_ns + self.bits_ns(frame_bits(frame))
+            sender, first = self._arbitrate(start_ns)
+            end_ns = start_ns + self.bits_ns(first.bits)
             if end_ns > now_ns:
                 break
-            found += self._transmit(sender, frame, start_ns, end_ns)
+            found += self._transmit(sender, first, start_ns, end_ns)
         return found
+
+    def _returning(self, at_ns: int) -> int | None:
+        return next((k for k, n in self._nodes.items() if n.recovers_ns and n.recovers_ns == at_ns), None)
 
     def _come_back(self, node: int, at_ns: int) -> list[Delivery]:
         own = self._nodes[node]
@@ -130,18 +169,20 @@ class CanBus:
         own.counters.recover()
         return self._say_state(node, at_ns)
 
-    def _arbitrate(self, start_ns: int) -> tuple[int, CanFrame]:
+    def _arbitrate(self, start_ns: int) -> tuple[int, _Waiting]:
         ready = [
-            (arbitration_rank(n.waiting[0][1]), k, n.waiting[0][1])
+            (arbitration_rank(n.waiting[0].frame), k)
             for k, n in self._nodes.items()
-            if n.waiting and not n.counters.off and n.waiting[0][0] <= start_ns and n.may_send_ns <= start_ns
+            if n.waiting and not n.counters.off and n.waiting[0].since_ns <= start_ns and n.may_send_ns <= start_ns
         ]
-        _, node, frame = min(ready)
-        return node, frame
+        node = min(ready)[1]
+        return node, self._nodes[node].waiting[0]
 
-    def _transmit(self, sender: int, frame: CanFrame, start_ns: int, end_ns: int) -> list[Delivery]:
+    def _transmit(self, sender: int, first: _Waiting, start_ns: int, end_ns: int) -> list[Delivery]:
+        frame = first.frame
         listeners = [k for k, n in self._nodes.items() if k != sender and not n.counters.off]
         disturbed = self._to_disturb > 0 or (self._error_rate > 0.0 and self._chance.random() < self._error_rate)
+        disturbed = self.disturbs(frame, start_ns) or disturbed
         if disturbed:
             self._to_disturb = max(0, self._to_disturb - 1)
         if disturbed or not listeners:
@@ -152,6 +193,7 @@ class CanBus:
         own.counters.sent()
         self._suspend(own, end_ns)
         self.frames += 1
+        self.waited_max_ns = max(self.waited_max_ns, start_ns - first.since_ns)
         found = [Delivery(end_ns, sender, frame, own=True)]
         for k in listeners:
             self._nodes[k].counters.received()

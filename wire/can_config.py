@@ -7,9 +7,10 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from softloop.wire.benchfile import Table
+from softloop.wire.channels import node_of
 from softloop.wire.errors import Unavailable
 
 if TYPE_CHECKING:  # reading a bench file needs none of these
@@ -20,7 +21,19 @@ if TYPE_CHECKING:  # reading a bench file needs none of these
     from softloop.wire.session import Wire
 
 _LOOK_AGAIN_S = 0.05
-_OWN_KEYS = ("interface", "channel", "bitrate", "can_filters", "session", "bench", "node", "congestion")
+_OWN_KEYS = ("interface", "channel", "bitrate", "can_filters", "session", "bench", "node", "congestion", "through_bus")
+
+
+class EmulationConfig(Table):
+    """`[can.NAME.emulation]`: a bus in time instead of a pipe. The simulated rig holds it; all nodes' frames go through it."""
+
+    restart_ms: float = Field(100.0, ge=0, le=60_000, description="a node that went off the bus comes back by itself; 0: never")
+    queue_frames: int = Field(64, ge=1, le=4096, description="of one node that wait for the bus at most; more are refused")
+    error_rate: float = Field(0.0, ge=0, le=0.5, description="how likely a transmission is destroyed by chance")
+    seed: int = Field(1, ge=0, description="of that chance")
+    bus_errors: bool = Field(
+        False, description="also tell a node of each failed transmission; wall pace only"
+    )
 
 
 class CanConfig(Table):
@@ -33,6 +46,7 @@ class CanConfig(Table):
     open_wait_s: float = Field(0.0, ge=0, le=600, description="how long a device file that is not there yet is waited for")
     mirror: bool = Field(True, description="also publish the frames of a bus that is not on Zenoh, for the log")
     options: dict[str, Any] = Field(default_factory=dict, description="more arguments of the python-can interface")
+    emulation: EmulationConfig | None = None
 
     @field_validator("options")
     @classmethod
@@ -41,6 +55,12 @@ class CanConfig(Table):
         if taken:
             raise ValueError(f"{', '.join(taken)} cannot stand in options")
         return value
+
+    @model_validator(mode="after")
+    def _emulates_what_is_not_there(self) -> CanConfig:
+        if self.emulation is not None and self.interface != "zenoh":
+            raise ValueError(f"emulation is for interface 'zenoh'; '{self.interface}' is a bus of its own")
+        return self
 
 
 def open_bus(config: CanConfig, wire: Wire, receive: Sequence[int] | None = None) -> can.BusABC:
@@ -59,7 +79,9 @@ def open_bus(config: CanConfig, wire: Wire, receive: Sequence[int] | None = None
     arguments: dict[str, Any] = dict(config.options)
     if config.interface == "zenoh":
         name = str(config.channel)
-        arguments |= {"session": wire.session, "bench": wire.bench, "node": wire.node_on(name), "congestion": wire.congestion}
+        node = wire.node_on(name) if config.emulation is None else node_of(wire.bench, wire.process, name)
+        arguments |= {"session": wire.session, "bench": wire.bench, "node": node, "congestion": wire.congestion}
+        arguments["through_bus"] = config.emulation is not None
     if receive is not None:
         arguments["can_filters"] = [{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in receive]
     # Only what the bench file says: python-can's own configuration files and variables are left out.

@@ -47,6 +47,11 @@ class CanFrame(NamedTuple):
     data: bytes
 
 
+def controller_of(node: int) -> int:
+    """The number under which the controller of a node on an emulated bus says its error frames; they are counted apart."""
+    return node | 1 << 63
+
+
 def _struct_of_message() -> struct.Struct:
     """The message's layout with its byte array as one item."""
     text, at = "<4s", 0

@@ -95,7 +95,11 @@ class CanPort:
         try:
             self._zenoh.send_frame(arbitration_id, data, stamp_ns, flags)
         except can.CanError as error:
-            raise Lost(self._say(error)) from None
+            if _number(error) not in _DOWN:
+                raise Lost(self._say(error)) from None
+            self._go_off()
+            self.unsent += 1
+            return False
         return True
 
     def note(self, frame: CanFrame) -> None:

@@ -3,13 +3,15 @@
 `can.Bus(interface="zenoh", channel="can0")` works in any process: those of one user meet at a Unix socket, with no router.
 Each frame is a `CanFrame` message on a key of its own, `softloop/<bench>/can/<channel>/<id>`. There is no arbitration, no
 bit time and no acknowledgement: what is sent arrives at once at all other buses of the channel, or, when a reader stalls,
-is dropped and never waited for. `bus.lost` counts the gaps in the senders' counters, `bus.dropped` what found this bus's
-own queue full, `bus.malformed` what came on the keys and was no frame.
+is dropped and never waited for. With `through_bus` it goes to the one who holds the channel as a bus in time (`can_owner`)
+instead, comes to all others from there, and error frames are heard that are this node's own. `bus.lost` counts the gaps in
+the senders' counters, `bus.dropped` what found this bus's own queue full, `bus.malformed` what came on the keys and was no frame.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import re
 import secrets
@@ -28,6 +30,7 @@ from softloop.wire.can_frame import (
     FLAG_EXTENDED,
     FRAME_SIZE,
     CanFrame,
+    controller_of,
     from_message,
     make_frame,
     pack_frame,
@@ -36,7 +39,7 @@ from softloop.wire.can_frame import (
     unpack_frame,
 )
 from softloop.wire.can_queue import FrameQueue
-from softloop.wire.channels import CAN, ROOT, can_key
+from softloop.wire.channels import CAN, ROOT, bus_key, can_key
 from softloop.wire.clock import Clock, WallClock
 from softloop.wire.config import default_endpoint
 from softloop.wire.errors import SoftloopError
@@ -59,8 +62,16 @@ class FramePublisher:
     priority for itself, and of four frames handed over at once two were lost, where batched ones all arrived.
     """
 
-    def __init__(self, session: zenoh.Session, bench: str, channel: str, congestion: zenoh.CongestionControl = _DROP) -> None:
-        self._session = session
+    def __init__(
+        self,
+        session: zenoh.Session,
+        bench: str,
+        channel: str,
+        congestion: zenoh.CongestionControl = _DROP,
+        key_of: Callable[[str, str, int], str] = can_key,
+    ) -> None:
+        """`key_of`: gives the key of (bench, channel, arbitration id)."""
+        self._session, self._key_of = session, key_of
         self._bench = bench
         self._channel = channel
         self._publishers: dict[int, zenoh.Publisher] = {}
@@ -75,7 +86,7 @@ class FramePublisher:
         """Publish a frame. Raises zenoh.ZError when the session is closed."""
         publisher = self._publishers.get(frame.arbitration_id)
         if publisher is None:
-            key = can_key(self._bench, self._channel, frame.arbitration_id)
+            key = self._key_of(self._bench, self._channel, frame.arbitration_id)
             if len(self._publishers) >= _MAX_PUBLISHERS:
                 self._session.put(key, pack_frame(frame), **self._qos)
                 return
@@ -102,6 +113,8 @@ class ZenohBus(can.BusABC):
         clock: where stamps come from; the machine's monotonic clock unless given.
         node: this bus's number among the senders, not 0; random unless given.
         congestion: wait for slow readers, or drop; drop unless given.
+        through_bus: the channel is a bus in time, which somebody on it holds (`[can.NAME.emulation]` of a bench file). Off
+            the bus, `send` then raises CanOperationError with ENETDOWN, as on SocketCAN.
         **ignored: whatever else configuration files and other interfaces' users pass (bitrate, timing, ...).
 
     Raises:
@@ -126,6 +139,7 @@ class ZenohBus(can.BusABC):
         clock: Clock | None = None,
         node: int = 0,
         congestion: zenoh.CongestionControl = _DROP,
+        through_bus: bool = False,
         fd: bool = False,
         **ignored: Any,
     ) -> None:
@@ -138,7 +152,7 @@ class ZenohBus(can.BusABC):
         self._receive_own = bool(receive_own_messages)
         self._clock: Clock = clock or WallClock()
         self._node = node or random_node()
-        self._congestion = congestion
+        self._congestion, self._through_bus = congestion, bool(through_bus)
         self._seq = itertools.count(1)
         self._state = can.BusState.ACTIVE
         self._queue = FrameQueue(rx_queue_size)
@@ -156,12 +170,13 @@ class ZenohBus(can.BusABC):
     def _attach(self, session: Any) -> None:
         head = f"{ROOT}/{self._bench}/{CAN.name}/{self._channel}/"
         self._key_head = head
-        self._publisher = FramePublisher(session, self._bench, self._channel, self._congestion)
-        self._name_key = f"{ROOT}/{self._bench}/buses/{self._channel}/{self._node:x}"
+        key_of = bus_key if self._through_bus else can_key
+        self._publisher = FramePublisher(session, self._bench, self._channel, self._congestion, key_of)
+        self._name_key = name_key(self._bench, self._channel, self._node)
         try:
             handler = zenoh.handlers.Callback(self._receive, indirect=False)
             self._subscriber = session.declare_subscriber(head + "*", handler)
-            self._answers = session.declare_queryable(self._name_key, zenoh.handlers.Callback(self._answer, indirect=False))
+            self._answers = answer_to(session, self._name_key)
             # An answer comes after its sender knows of this subscription: from now on no frame passes it by.
             _buses_there(session, self._bench, self._channel)
         except zenoh.ZError as error:
@@ -177,17 +192,19 @@ class ZenohBus(can.BusABC):
             with self._counting:
                 self.malformed += 1
             return
-        if frame.node != self._node:
+        if self._through_bus and frame.flags & FLAG_ERROR:
+            if frame.node != controller_of(self._node):  # what another node's controller says to its own driver
+                return
+            self._state = state_after(self._state, frame)
+        elif self._through_bus and self._state == can.BusState.ERROR:  # a node that is off the bus hears nothing
+            return
+        elif frame.node != self._node:
             self._count_lost(frame)
             self._state = state_after(self._state, frame)
         elif not self._receive_own:
             return
         if self._wanted(frame):
             self._queue.put(frame)
-
-    def _answer(self, query: zenoh.Query) -> None:
-        with query, contextlib.suppress(zenoh.ZError):
-            query.reply(self._name_key, b"")
 
     def _count_lost(self, frame: CanFrame) -> None:
         with self._counting:
@@ -226,6 +243,8 @@ class ZenohBus(can.BusABC):
     def _put(self, frame: CanFrame) -> None:
         if self._is_shutdown:
             raise can.CanOperationError("the bus is shut down")
+        if self._through_bus and self._state == can.BusState.ERROR:
+            raise can.CanOperationError("the node is off the bus", errno.ENETDOWN)
         try:
             self._publisher.put(frame)
         except zenoh.ZError as error:
@@ -273,6 +292,21 @@ class ZenohBus(can.BusABC):
         """The channels in use on the default bench, or `can0` when there is none."""
         channels = _channels_in_use(DEFAULT_BENCH, default_endpoint(DEFAULT_BENCH)) or {"can0"}
         return [{"interface": "zenoh", "channel": name} for name in sorted(channels)]
+
+
+def name_key(bench: str, channel: str, node: int) -> str:
+    """The key on which a bus object answers that it is there; 0 is the number of who holds an emulated bus."""
+    return f"{ROOT}/{bench}/buses/{channel}/{node:x}"
+
+
+def answer_to(session: zenoh.Session, own_key: str) -> Any:
+    """Answer whoever asks for the buses that are there: it then knows of the subscriptions declared before."""
+
+    def answer(query: zenoh.Query) -> None:
+        with query, contextlib.suppress(zenoh.ZError):
+            query.reply(own_key, b"")
+
+    return session.declare_queryable(own_key, zenoh.handlers.Callback(answer, indirect=False))
 
 
 def random_node() -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from zlib import crc32
 
 MS = 1_000_000
 
@@ -40,10 +41,11 @@ EVENT = Channel("event", "Event", 0.0)
 CYCLE = Channel("cycle", "CycleRecord", 200.0)
 TRUTH = Channel("truth", "PlantTruth", 200.0)
 STATUS = Channel("status", "ProcessStatus", 1.0)
+CAN_BUS = Channel("canbus", "CanBusStatus", 0.0)  # of each emulated CAN bus, ten times a second
 CLOCK = Channel("clock", "ClockOffset", 10.0)  # with several hosts: from each but that of the controller
 CAN = Channel("can", "CanFrame", 600.0, realtime=True)  # key: can/<bus>/<arbitration id in hex>
 
-CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, ARM, EVENT, CYCLE, TRUTH, STATUS, CLOCK, CAN)
+CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, ARM, EVENT, CYCLE, TRUTH, STATUS, CAN_BUS, CLOCK, CAN)
 
 # Asked for and answered, not published (`wire.questions`): a fault for the simulated rig, answered by the plant alone.
 FAULT = Channel("fault", "FaultRequest", 0.0, logged=False)
@@ -55,6 +57,9 @@ TICK = Channel("tick", "Tick", 200.0, realtime=True, logged=False)
 HELLO = Channel("hello", "Watermark", 0.0, realtime=True, logged=False)
 WATERMARK = Channel("watermark", "Watermark", 200.0, realtime=True, logged=False)
 END = Channel("end", "Watermark", 0.0, realtime=True, logged=False)
+
+# What waits for an emulated CAN bus, and has not stood on it yet: nobody hears it but whoever holds the bus.
+BUS_ROOT = "softloop-bus"
 
 # Between the launchers of a bench's hosts, on keys of their own too: their words, and the question for the time.
 HOSTS_ROOT = "softloop-hosts"
@@ -70,6 +75,16 @@ def key(bench: str, channel: Channel) -> str:
 def can_key(bench: str, bus: str, arbitration_id: int) -> str:
     """Zenoh key of a CAN frame, so that access rules can tell frames apart: `softloop/<bench>/can/<bus>/<id>`."""
     return f"{ROOT}/{bench}/{CAN.name}/{bus}/{arbitration_id:x}"
+
+
+def bus_key(bench: str, bus: str, arbitration_id: int) -> str:
+    """Key on which a node hands a frame to the emulated bus that is to carry it: `softloop-bus/<bench>/<bus>/<id>`."""
+    return f"{BUS_ROOT}/{bench}/{bus}/{arbitration_id:x}"
+
+
+def node_of(bench: str, process: str, bus: str) -> int:
+    """The number of a process among a bus's senders where it has to be the same each time; not 0."""
+    return crc32(f"{bench} {process} {bus}".encode()) + 1
 
 
 def alive_key(bench: str, process: str) -> str:

@@ -16,8 +16,10 @@ ALWAYS_S = 1e9
 LINE_ACTIONS = ("drop", "delay", "duplicate", "reorder", "corrupt")
 # Kinds whose size means something, and what. All others have none; `corrupt` may have one.
 SIZED = {"delay": "ms", "step": "ms", "bias": "kPa, deg or deg/s", "noise": "its standard deviation"}
-# Target -> the process that injects.
+# Target -> the process that injects. A bus in time is the plant's.
 CAN_TARGETS = {"analog": "pressures", "driver": "valves", "command": "valves"}
+BABBLE_TARGETS = ("first", "last")  # in arbitration
+BUS_TARGETS = dict.fromkeys((*CAN_TARGETS, *BABBLE_TARGETS), "plant")
 SERIAL_TARGETS = {"inclinometer": "inclinometer"}
 ZENOH_TARGETS = {"pressure": "pressures", "inclination": "inclinometer", "command": "controller", "valves": "valves"}
 SENSOR_TARGETS = {
@@ -27,6 +29,7 @@ PROCESSES = ("plant", "valves", "pressures", "inclinometer", "controller", "reco
 LAUNCHER = "launcher"
 TARGETS: dict[str, dict[str, str]] = {
     "can": CAN_TARGETS,
+    "bus": BUS_TARGETS,
     "serial": SERIAL_TARGETS,
     "zenoh": ZENOH_TARGETS,
     "sensor": SENSOR_TARGETS,
@@ -37,6 +40,7 @@ TARGETS: dict[str, dict[str, str]] = {
 
 Kind = Literal[
     "can_drop", "can_delay", "can_duplicate", "can_reorder", "can_corrupt", "can_error_frames", "can_bus_off",
+    "bus_disturb", "bus_babble",
     "serial_drop", "serial_delay", "serial_duplicate", "serial_reorder", "serial_corrupt",
     "zenoh_drop", "zenoh_delay", "zenoh_duplicate", "zenoh_reorder", "zenoh_corrupt",
     "sensor_stuck", "sensor_bias", "sensor_noise", "sensor_nan",
@@ -44,19 +48,25 @@ Kind = Literal[
 ]  # fmt: skip
 
 
-class InjectionConfig(Table):
-    """One thing that goes wrong between devices and processes. Times count from the instant at which the gate is armed."""
+class InjectionFields(Table):
+    """What an injection consists of, in a bench file and in a scenario."""
 
-    kind: Kind = Field(description="what goes wrong; see docs/faults.md")
+    kind: str = Field(description="what goes wrong; docs/faults.md lists the kinds")
     target: str = Field("", description="where: a wire, a channel, a sensor's value or a process, as docs/faults.md lists them")
     at_s: float = Field(ge=0, description="when it begins")
     duration_s: float = Field(ALWAYS_S, gt=0, description="default: it stays")
     probability: float = Field(1.0, gt=0, le=1, description="how likely each frame, byte, sample or value is hit")
     size: float = Field(0.0, description="delay, step: ms; bias: kPa, deg, deg/s; noise: its deviation; corrupt: bits, 0 is one")
 
+
+class InjectionConfig(InjectionFields):
+    """One thing that goes wrong between devices and processes. Times count from the instant at which the gate is armed."""
+
+    kind: Kind = Field(description="what goes wrong; docs/faults.md lists the kinds")
+
     @property
     def family(self) -> str:
-        """What it is done to: can, serial, zenoh, sensor, process, clock, disk."""
+        """What it is done to: can, bus, serial, zenoh, sensor, process, clock, disk."""
         return self.kind.partition("_")[0]
 
     @property
@@ -72,7 +82,7 @@ class InjectionConfig(Table):
     @property
     def has_chance(self) -> bool:
         """It hits things one by one, each with its probability."""
-        return self.family in ("can", "serial", "zenoh", "sensor")
+        return self.family in ("can", "serial", "zenoh", "sensor") or self.kind == "bus_disturb"
 
     @property
     def needs_wall(self) -> bool:
@@ -84,6 +94,9 @@ class InjectionConfig(Table):
         allowed = TARGETS[self.family]
         if self.target not in allowed:
             names = ", ".join(name for name in allowed if name) or "(none)"
+            raise ValueError(f"kind '{self.kind}' has no target '{self.target}'; it has: {names}")
+        if self.family == "bus" and (self.target in BABBLE_TARGETS) != (self.action == "babble"):
+            names = ", ".join(BABBLE_TARGETS if self.action == "babble" else CAN_TARGETS)
             raise ValueError(f"kind '{self.kind}' has no target '{self.target}'; it has: {names}")
         if self.target == "command" and self.action in ("error_frames", "bus_off"):
             raise ValueError(f"kind '{self.kind}' has no target 'command'; a node's trouble is that of target 'driver'")

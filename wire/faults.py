@@ -51,6 +51,10 @@ class FrameSink(Protocol):
 class NoFaults:
     """The wires as they are."""
 
+    def of(self, family: str, target: str) -> list[Strike]:
+        """What is done to a target."""
+        return []
+
     def frames(self, source: FrameSource, port: CanPort, wire: int) -> FrameSource:
         """The frames of one of the rig's wires (WIRE_*), which come by way of `port`."""
         return source

@@ -8,7 +8,6 @@ import secrets
 import sys
 import threading
 import time
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ from typing import Any
 import zenoh
 
 from softloop.wire.backlog import Backlog
-from softloop.wire.channels import ROOT, Channel, alive_key, key
+from softloop.wire.channels import ROOT, Channel, alive_key, key, node_of
 from softloop.wire.config import TLS, ZenohConfig
 from softloop.wire.errors import Unavailable
 from softloop.wire.identity import Identity, identity_of
@@ -280,7 +279,7 @@ class Wire:
     def node_on(self, bus: str) -> int:
         """The number of this process among a CAN bus's senders: random, and at lockstep pace the same in each run; not 0."""
         if self.exact:
-            return zlib.crc32(f"{self.bench} {self.process} {bus}".encode()) + 1
+            return node_of(self.bench, self.process, bus)
         return secrets.randbits(63) + 1
 
     def declare_publisher(self, full_key: str, *, realtime: bool) -> zenoh.Publisher:

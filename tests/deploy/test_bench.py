@@ -58,6 +58,22 @@ def write(folder, text, name="bench.toml"):
         (("[plant]", "[plant]\ncan_analog = 'x'"), "key 'plant.can_analog': there is no [can.x]; there are: can0"),
         (("[pressures]", "[pressures]\ncan = 'can1'"), "there is no [can.can1]; there are: can0"),
         (("[valves]", "[valves]\nangle_min_deg = 300.0"), "key 'valves': angle_min_deg must be below angle_max_deg"),
+        (
+            ("[can.can0]", "[can.can1.emulation]\n[can.can0]"),
+            "key 'can.can1.emulation': the simulated rig holds an emulated bus, so [plant] must be on [can.can1]",
+        ),
+        (
+            ("[can.can0]", '[pace]\nmode = "lockstep"\n[can.can0.emulation]\nbus_errors = true\n[can.can0]'),
+            "key 'can.can0.emulation.bus_errors': must be false at lockstep pace",
+        ),
+        (
+            ("[can.can0]", '[[faults.injections]]\nkind = "bus_disturb"\ntarget = "driver"\nat_s = 1.0\n[can.can0]'),
+            "key 'faults.injections': kind 'bus_disturb' needs a [can.NAME.emulation]",
+        ),
+        (
+            ("[can.can0]", '[zenoh.tls]\nfolder = "keys"\n[can.can0.emulation]\n[can.can0]'),
+            "key 'can': on a secured bench the gate alone may put valve frames on the wire",
+        ),
         (('[inclinometer]\nport = "{run_dir}/inclinometer"', ""), "the gate needs the tables [pressures] and [inclinometer]"),
         (('name = "whole"', 'name = "Whole!"'), "key 'name': String should match pattern"),
         (('name = "whole"', f'name = "{"n" * 25}"'), "key 'name': String should match pattern"),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from softloop.watch.overview import LATE_EDGES_US, Overview
-from softloop.wire.channels import CYCLE, EVENT, PRESSURE, STATUS, can_key, key
+from softloop.wire.channels import CAN_BUS, CYCLE, EVENT, PRESSURE, STATUS, can_key, key
 from softloop.wire.messages import message
 
 BENCH = "b"
@@ -47,6 +47,17 @@ def test_the_load_of_a_bus_is_the_time_its_frames_stand_on_it():
     seen.take([], 0.0)
     seen.take(frames, 1.0)
     assert seen.buses["can0"].load_percent == pytest.approx(450 * (47 + 64) / 500_000 * 100)
+
+
+def test_an_emulated_bus_speaks_for_itself():
+    seen = Overview(BENCH, {"can0": 500_000}, {}, lambda dlc, bitrate: 0, emulated=("can0",))
+    assert seen.buses["can0"].words == ""
+    told = {"load": 0.148, "nodes": 4, "state": [0, 0, 3, 0, 0, 0, 0, 0], "transmit_errors": [0, 0, 255, 0, 0, 0, 0, 0]}
+    seen.take([(key(BENCH, CAN_BUS), made("CanBusStatus", seq=1, disturbed=32, waited_max_ns=240_000, **told))], 1.0)
+    assert seen.buses["can0"].load_percent == pytest.approx(14.8)
+    assert seen.buses["can0"].words == "gate bus off (255/0), 32 disturbed, waited 0.24 ms at most"
+    seen.take([(key(BENCH, CAN_BUS), made("CanBusStatus", seq=2, bus=7))], 2.0)  # of no bus that is known
+    seen.take([(key(BENCH, CAN_BUS), made("CanBusStatus", seq=3, nodes=255, state=[9] * 8))], 3.0)
 
 
 def test_lateness_is_of_ticks_and_early_ones_count_as_on_time():

@@ -114,7 +114,8 @@ def test_table_defaults_and_faults():
     for table, word in (
         (
             {"chanel": "can0"},
-            "unknown key 'chanel'; allowed here: bitrate, channel, interface, mirror, open_wait_s, options, send_timeout_ms",
+            "unknown key 'chanel'; allowed here: bitrate, channel, emulation, interface, mirror, open_wait_s, options, "
+                "send_timeout_ms",
         ),
         ({"bitrate": 1}, "bitrate"),
         ({"options": {"channel": "x", "bitrate": 1}}, "bitrate, channel cannot stand in options"),
@@ -412,3 +413,15 @@ def test_slcan_peer_frozen_hangs_nobody(ports, folder):
         other.kill()
         other.wait(WAIT_S)
         other.stdout.close()
+
+
+def test_a_bus_that_is_one_is_not_emulated():
+    assert CanConfig(emulation={}).emulation.restart_ms == 100.0
+    for table, word in (
+        ({"interface": "socketcan", "emulation": {}}, "emulation is for interface 'zenoh'; 'socketcan' is a bus of its own"),
+        ({"emulation": {"restart": 1}}, "unknown key 'emulation.restart'"),
+        ({"emulation": {"error_rate": 2.0}}, "error_rate"),
+        ({"options": {"through_bus": True}}, "through_bus cannot stand in options"),
+    ):
+        with pytest.raises(BadConfig, match=word):
+            load_model(CanConfig, table, "bench.toml")
