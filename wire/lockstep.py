@@ -202,7 +202,6 @@ class Lockstep(Pace):
         self._put[channel.name](_WATERMARK.pack(mark))
 
     def hello(self) -> None:
-        """Say that this process is there."""
         self.say(HELLO)
 
     def meet(self, wanted: Collection[str], meanwhile: Callable[[], None] | None) -> bool:
@@ -392,7 +391,10 @@ class Follower(Lockstep):
     def requests(self, source: Inbox) -> Requests:
         return PacedRequests(self, source)
 
-    def newest(self, source: Newest, process: str, lag: int = 0) -> Newest:
+    def hear_out(self, process: str, lag: int = 0) -> None:
         self.board.follow(process)
         self._inputs.append((process, lag))
+
+    def newest(self, source: Newest, process: str, lag: int = 0) -> Newest:
+        self.hear_out(process, lag)
         return PacedNewest(self, source, process)
