@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
+from typing import Self
 
 from pydantic import Field, model_validator
 
@@ -16,7 +17,13 @@ class EstimateConfig(Table):
 
     segment_s: float = Field(8.0, ge=1, le=120, description="length of a Hann segment, half overlapped; 2.5 must fit")
     excited_db: float = Field(-20.0, gt=-80, lt=0, description="a frequency is excited when this near the strongest, run A")
-    delay_max_s: float = Field(0.5, gt=0, le=5, description="delays are looked for up to this, either way")
+    delay_max_s: float = Field(0.5, gt=0, le=5, description="delays are looked for up to this, either way; half a segment at most")
+
+    @model_validator(mode="after")
+    def _leaves_a_segment(self) -> Self:
+        if self.delay_max_s > 0.5 * self.segment_s:
+            raise ValueError(f"delay_max_s must be at most half of segment_s ({self.segment_s:g})")
+        return self
 
 
 class ExcitationConfig(Table):
@@ -106,7 +113,7 @@ class ParityBounds(Table):
         return found
 
     @model_validator(mode="after")
-    def _judges_something(self) -> ParityBounds:
+    def _judges_something(self) -> Self:
         if not any(isinstance(table, ChannelBounds) and table.judges for table in vars(self).values()):
             raise ValueError("no channel has a bound, so that any two runs would pass")
         return self

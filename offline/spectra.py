@@ -13,6 +13,7 @@ from softloop.offline.parity_bounds import EstimateConfig
 Floats = NDArray[np.float64]
 SEGMENTS_LEAST = 2.5  # their lengths: four half-overlapped ones, under which a coherence says nothing
 _WEIGHT_LIMIT = 1.0 - 1e-9  # of a coherence in the weight g / (1 - g)
+_ROUNDS = 5  # each leaves a tenth or less of the delay that was left
 _RELATIVE_LEAST = 1e-9  # a swing smaller than this part of the value is rounding
 
 
@@ -65,11 +66,11 @@ class Estimate:
 def spectra(x: Floats, y: Floats, rate_hz: float, config: EstimateConfig) -> Spectra | None:
     """Welch's spectra of two signals (n,) sampled together; None where one stands still.
 
-    Raises ValueError when they are shorter than `SEGMENTS_LEAST` segments.
+    Raises ValueError when they are shorter than one segment.
     """
     length = round(config.segment_s * rate_hz)
-    if len(x) < SEGMENTS_LEAST * length:
-        raise ValueError(f"{len(x)} samples are fewer than {SEGMENTS_LEAST:g} segments of {length}")
+    if len(x) < length:
+        raise ValueError(f"{len(x)} samples are fewer than a segment of {length}")
     if any(np.ptp(one) <= _RELATIVE_LEAST * (1.0 + np.abs(one).max()) for one in (x, y)):
         return None
     options = {"fs": rate_hz, "nperseg": length, "detrend": "constant"}
@@ -93,7 +94,7 @@ def estimate(x: Floats, y: Floats, rate_hz: float, config: EstimateConfig) -> Es
     if coherence <= chance(found.segments):
         return Estimate(*plain, coherence, None, None, *edges)
     gain = float(np.abs(found.xy[band]).sum() / power.sum())
-    return Estimate(*plain, coherence, 1e3 * delay_s(x, y, found, rate_hz, config), gain, *edges)
+    return Estimate(*plain, coherence, 1e3 * delay_s(x, y, rate_hz, config), gain, *edges)
 
 
 def chance(segments: int) -> float:
@@ -101,17 +102,30 @@ def chance(segments: int) -> float:
     return float(1.0 - 0.05 ** (1.0 / max(segments - 1, 1)))
 
 
-def delay_s(x: Floats, y: Floats, found: Spectra, rate_hz: float, config: EstimateConfig) -> float:
+def delay_s(x: Floats, y: Floats, rate_hz: float, config: EstimateConfig) -> float:
     """By how much y is behind x: whole samples by their correlation, the rest by the slope of the cross-spectrum's phase.
 
-    Each frequency weighs what its phase is worth, by its coherence g as g / (1 - g).
+    A window that is not moved along with the delay bends that phase towards 0, so y is moved by what was found and the rest
+    estimated again, until there is none.
     """
-    whole_s = _whole_samples(x, y, round(config.delay_max_s * rate_hz)) / rate_hz
-    omega = 2.0 * np.pi * found.hz[found.excited]
-    phase = np.angle(found.xy[found.excited] * np.exp(1j * omega * whole_s))
+    most = round(config.delay_max_s * rate_hz)
+    behind = float(_whole_samples(x, y, most))
+    inner = np.arange(most + 1, len(x) - most - 1)
+    for _ in range(_ROUNDS):
+        moved = np.interp(inner + np.clip(behind, -most, most), np.arange(len(y)), y)
+        found = spectra(x[inner], moved, rate_hz, config)
+        if found is None:
+            break
+        behind += rate_hz * _phase_slope_s(found)
+    return behind / rate_hz
+
+
+def _phase_slope_s(found: Spectra) -> float:
+    """The delay in the cross-spectrum's phase. Each frequency weighs what its phase is worth, by its coherence g as g / (1 - g)."""
+    omega, phase = 2.0 * np.pi * found.hz[found.excited], np.angle(found.xy[found.excited])
     coherent = np.minimum(found.coherence[found.excited], _WEIGHT_LIMIT)
     weight = coherent / (1.0 - coherent)
-    return whole_s - float(np.sum(weight * omega * phase) / np.sum(weight * omega**2))
+    return -float(np.sum(weight * omega * phase) / np.sum(weight * omega**2))
 
 
 def _whole_samples(x: Floats, y: Floats, most: int) -> int:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softloop.wire.channels import CAN, CYCLE, EVENT, PRESSURE, STATUS, VALVES, WATERMARK, Channel, channel_of_key
+from softloop.wire.channels import CAN, CYCLE, EVENT, PRESSURE, SHADOW, STATUS, VALVES, WATERMARK, Channel, channel_of_key
 from softloop.wire.messages import BadPayload, constant, message
 
 RATE_WINDOW_S = 2.0
@@ -20,7 +20,7 @@ RECENT_TICKS = 2_000  # ten seconds
 LATE_EDGES_US = np.concatenate([[0.0], np.geomspace(10.0, 100_000.0, 25), [np.inf]])  # six bins a decade, 10 us to 100 ms
 _PLANT, _KIND_FAULT = constant("Event", "SOURCE_PLANT"), constant("Event", "KIND_FAULT")
 _STARTING = constant("ProcessStatus", "STATE_STARTING")
-_KEPT = {CYCLE.name, VALVES.name, PRESSURE.name}
+_KEPT = {CYCLE.name, VALVES.name, PRESSURE.name, SHADOW.name}
 FrameTime = Callable[[int, int], int]  # data bytes, bit/s -> ns on the bus
 
 
