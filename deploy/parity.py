@@ -17,6 +17,9 @@ from softloop.offline.vector import make_folder
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK
 
 
+WIDTH = 112  # of the table, also where output goes into a file
+
+
 def judge_parity(run_a: Path, run_b: Path, bounds_file: Path | None, folder: Path, *, as_json: bool) -> int:
     """Compare, print, leave a page in `folder`.
 
@@ -40,10 +43,10 @@ def judge_parity(run_a: Path, run_b: Path, bounds_file: Path | None, folder: Pat
 
 def show(found: Parity, bounds: ParityBounds, page: Path) -> None:
     """The table, and a line for each reason."""
-    console = Console(highlight=False)
+    console = Console(highlight=False, width=max(Console().width, WIDTH))
     table = Table(box=None, pad_edge=False)
     for head in HEADS:
-        table.add_column(head, justify="left" if head in ("channel", "unit", "verdict") else "right")
+        table.add_column(head, justify="left" if head in ("channel", "unit", "verdict") else "right", no_wrap=True)
     for one in found.channels:
         table.add_row(*cells(one, bounds.of(one.signal.name)))
     console.print(table)

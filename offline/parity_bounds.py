@@ -17,7 +17,9 @@ class EstimateConfig(Table):
 
     segment_s: float = Field(8.0, ge=1, le=120, description="length of a Hann segment, half overlapped; 2.5 must fit")
     excited_db: float = Field(-20.0, gt=-80, lt=0, description="a frequency is excited when this near the strongest, run A")
-    delay_max_s: float = Field(0.5, gt=0, le=5, description="delays are looked for up to this, either way; half a segment at most")
+    delay_max_s: float = Field(
+        0.5, gt=0, le=5, description="delays are looked for up to this, either way; half a segment at most"
+    )
 
     @model_validator(mode="after")
     def _leaves_a_segment(self) -> Self:

@@ -100,18 +100,21 @@ class Shadow:
         while self._waiting and self._waiting[0][0] <= to_ns:
             stamp_ns, _, channel, values = heappop(self._waiting)
             said += self._up_to(stamp_ns)
+            if self._state is not None:
+                advance(self._params, self._state, stamp_ns)
             self._take(stamp_ns, channel, values)
         return said + self._up_to(to_ns)
 
     def _up_to(self, to_ns: int) -> list[Any]:
-        """Bring the plant to a time, and say how it stands at every full period."""
+        """Say how the plant stands at every full period up to a time.
+
+        It is not brought to `to_ns` itself: where the steps of the integration lie must follow from the stamps alone.
+        """
         said = []
         while self._state is not None and self._next_ns <= to_ns:
             advance(self._params, self._state, self._next_ns)
             said.append(self._divergence(self._next_ns))
             self._next_ns += PERIOD_NS
-        if self._state is not None:
-            advance(self._params, self._state, to_ns)
         return said
 
     def _take(self, stamp_ns: int, channel: str, values: tuple[float, ...]) -> None:

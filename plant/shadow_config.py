@@ -18,8 +18,8 @@ class ShadowConfig(SpecimenConfig):
         description="which drive it: as the gate sent them, or as measured; always measured while the driver vents by itself",
     )
     behind_ms: float = Field(30.0, ge=5, le=1000, description="it stays so far behind the clock, so that all has arrived")
-    correction_s: float = Field(2.0, ge=0, le=100, description="so slowly its chamber follows the measured pressure; 0: never")
-    correction_max_kpa_s: float = Field(10.0, gt=0, le=1000, description="and never faster than this")
+    correction_s: float = Field(0.2, ge=0, le=100, description="so slowly its chamber follows the measured pressure; 0: never")
+    correction_max_kpa_s: float = Field(100.0, gt=0, le=1000, description="and never faster than this")
     window_s: float = Field(1.0, gt=0, le=60, description="over which the root mean squares are taken")
 
     @property
