@@ -26,7 +26,7 @@ class ShadowLoop:
         self._clock = context.clock
         self._shadow = Shadow(process)
         self._behind_ns = round(1e6 * process.table.behind_ms)
-        self._inbox = context.wire.inbox(*_HEARD)
+        self._inbox, self._lost = context.wire.inbox(*_HEARD), 0
         for speaker in _HEARD.values():
             context.pace.hear_out(speaker)
         self._put = context.wire.publisher(SHADOW)
@@ -42,6 +42,8 @@ class ShadowLoop:
                 self._status.dropped += 1
         for divergence in self._shadow.advance_to(self._clock.now_ns() - self._behind_ns):
             self._put(message(SHADOW.message).pack(divergence))
+        self._status.dropped += self._inbox.dropped - self._lost
+        self._lost = self._inbox.dropped
         self._status.cycle()
 
     def close(self) -> None:

@@ -41,14 +41,15 @@ from softloop.wire.session import Inbox, Wire
 from softloop.wire.shell import Stop
 
 PLANT, CONTROLLER, VALVES, RECORDER, LAUNCHER = "plant", "controller", "valves", "recorder", "launcher"
+LISTENERS = (RECORDER, "shadow")  # the plant does not run far ahead of them
 # Times `timeout_s` that is waited for whom: the farther along the chain of a tick, the longer.
 PATIENCE = {CONTROLLER: 1.25, VALVES: 1.5, RECORDER: 1.5, PLANT: 2.0}
 _TICK, _WATERMARK = message("Tick"), message("Watermark")
 _WIRES, _PIECES = constant("Tick", "WIRES"), constant("Tick", "PIECES")
 _HELLO_S = 0.02
 _LOOK_S = 0.05  # how often a waiting process looks whether it has been asked to stop
-# How far the plant may be ahead of the recorder: 14 messages a tick, far fewer than its backlog holds.
-RECORDER_TICKS = 200
+# How far the plant may be ahead of a listener: 14 messages a tick, far fewer than its backlog holds.
+LISTENER_TICKS = 200
 
 
 class RigClock:
@@ -242,8 +243,8 @@ class Leader(Lockstep):
         super().__init__(config, wire, stop, others)
         self.rig_clock.on_sleep = self._end_tick
         self._put_tick = self._publisher(wire, TICK)
-        self.board.follow(VALVES)
-        self.board.follow(RECORDER)
+        for process in (VALVES, *LISTENERS):
+            self.board.follow(process)
         self.target_ns = START_NS  # the rig clock of the tick in hand, once the frames of the last one are taken
         self._tick = self._ticks = 0
         self._pieces: list[list[tuple[int, int]]] = [[] for _ in range(_WIRES)]
@@ -265,8 +266,8 @@ class Leader(Lockstep):
         self._announce(last)
         done = self._tick + 1
         self.board.wait_done(VALVES, done)
-        if RECORDER in self.others:
-            self.board.wait_done(RECORDER, done - RECORDER_TICKS)
+        for process in (p for p in LISTENERS if p in self.others):
+            self.board.wait_done(process, done - LISTENER_TICKS)
         if last:
             self.end()
         self._tick += 1

@@ -74,7 +74,11 @@ def test_measured_currents_drive_it_too(heard):
 
 def test_while_the_driver_vents_by_itself_its_measured_currents_count():
     status = message("ValveStatus").make(
-        stamp_ns=50, driver_stamp_ns=7, charge_current_ma=1.0, charge_coil_ma=2.0, driver=constant("ValveStatus", "DRIVER_WATCHDOG")
+        stamp_ns=50,
+        driver_stamp_ns=7,
+        charge_current_ma=1.0,
+        charge_coil_ma=2.0,
+        driver=constant("ValveStatus", "DRIVER_WATCHDOG"),
     )
     assert shadow().currents_of(status) == (7, (2.0, 0.0))
     sent_ns, sent = shadow().currents_of(status._replace(driver=constant("ValveStatus", "DRIVER_OK")))
