@@ -16,7 +16,6 @@ from softloop.offline.run_log import open_run
 from softloop.offline.vector import make_folder
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK
 
-
 WIDTH = 112  # of the table, also where output goes into a file
 
 

@@ -121,7 +121,7 @@ def delay_s(x: Floats, y: Floats, rate_hz: float, config: EstimateConfig) -> flo
 
 
 def _phase_slope_s(found: Spectra) -> float:
-    """The delay in the cross-spectrum's phase. Each frequency weighs what its phase is worth, by its coherence g as g / (1 - g)."""
+    """The delay in the cross-spectrum's phase. Each frequency weighs what its phase is worth: g / (1 - g) of its coherence g."""
     omega, phase = 2.0 * np.pi * found.hz[found.excited], np.angle(found.xy[found.excited])
     coherent = np.minimum(found.coherence[found.excited], _WEIGHT_LIMIT)
     weight = coherent / (1.0 - coherent)

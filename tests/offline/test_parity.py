@@ -1,6 +1,8 @@
 """Two runs of one excitation against bounds."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 import synthetic
@@ -124,6 +126,15 @@ def test_what_does_not_compare_is_refused_in_one_line(runs, tmp_path, name, erro
     assert not (tmp_path / "out").exists()
 
 
+def test_the_command_line_gives_the_code_and_one_line_on_an_error(runs, tmp_path):
+    words = [sys.executable, "-m", "softloop.deploy.cli", "parity", str(runs / "measure"), "--out", str(tmp_path / "out")]
+    for name, code in (("same", 0), ("loud", 1), ("dwells", 2)):
+        command = [*words, str(runs / name), "--bounds", str(runs / "bounds.toml")]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == code, done.stderr
+        assert len(done.stderr.splitlines()) == (code == 2)
+
+
 def test_another_law_is_another_excitation(runs, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "BENCH_TOML", b'name = "other"\n[controller]\nlaw = "pid"\n')
@@ -175,7 +186,9 @@ def test_any_content_is_taken_or_refused_in_one_line(content):
     try:
         bounds = load_model(ParityBounds, content, "bounds.toml")
     except BadConfig as error:
-        assert "\n" not in str(error)
+        lines = str(error).splitlines()
+        if len(lines) != 1:
+            pytest.fail(f"{len(lines)} lines: {error}")
     else:
         assert any(bounds.of(one.name).judges for one in SIGNALS)
         assert isinstance(bounds.estimate, EstimateConfig)
