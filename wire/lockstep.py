@@ -121,8 +121,7 @@ class Board:
 
     def done(self, process: str) -> int:
         """How many ticks a followed process is done with."""
-        mark = self.marks.get(process)
-        return 0 if mark is None else int(mark.tick)
+        return int(self.marks[process].tick) if process in self.marks else 0
 
     def wait(
         self,
@@ -202,9 +201,6 @@ class Lockstep(Pace):
         )
         self._put[channel.name](_WATERMARK.pack(mark))
 
-    def hello(self) -> None:
-        self.say(HELLO)
-
     def meet(self, wanted: Collection[str], meanwhile: Callable[[], None] | None) -> bool:
         """Until each of `wanted` has said hello; False when asked to stop. Raises Lost, naming who is missing."""
         present = self.board.present
@@ -251,7 +247,7 @@ class Leader(Lockstep):
         self._on_wire = [0] * _WIRES
 
     def begin(self) -> None:
-        if self.meet([*self.others, LAUNCHER], self.hello):
+        if self.meet([*self.others, LAUNCHER], lambda: self.say(HELLO)):
             self._ticks = int(self.board.present[LAUNCHER].ticks)
 
     def note_piece(self, wire: int, amount: int, arrival_ns: int) -> None:
@@ -301,15 +297,15 @@ class Follower(Lockstep):
         self._inputs: list[tuple[str, int]] = []
 
     def begin(self) -> None:
-        self.hello()
-        self.meet(self.others, self.hello)
+        self.say(HELLO)
+        self.meet(self.others, lambda: self.say(HELLO))
 
     def keep_up(self, take: Callable[[], object]) -> None:
         newest = self.board.tick
         all_ended = self.board.ended.keys() >= set(self.others)
         take()
         if newest is None:
-            self.hello()
+            self.say(HELLO)
         else:
             self.say(WATERMARK, int(newest.tick) + 1)
         if all_ended:
@@ -334,7 +330,7 @@ class Follower(Lockstep):
         there = self.board.wait(
             lambda: self.board.tick is not None and self.board.tick.seq > after,
             lambda: f"'{PLANT}'",
-            None if after else self.hello,
+            None if after else lambda: self.say(HELLO),
             PATIENCE[PLANT],
         )
         if there:
