@@ -168,7 +168,7 @@ def test_processes_are_those_whose_tables_stand_in_the_file():
         "shadow",
     }
     real = load_bench(shipped_benches()["real"])
-    assert {p.name for p in processes_of(real)} == {p.name for p in PROCESSES} - {"monitor", "shadow", "plant"}
+    assert {p.name for p in processes_of(real)} == everything - {"plant"}
     with pytest.raises(BadConfig, match="bench 'real' has no process 'plant'; it has: recorder, valves, "):
         find_process(real, "plant")
 
