@@ -22,6 +22,7 @@ from softloop.deploy.config import CalibrationConfig, MachineConfig, RunConfig
 from softloop.deploy.hosts import check_hosts
 from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig, pressures_process, valves_process
 from softloop.plant.config import PlantConfig, emulated_buses, plant_process
+from softloop.plant.shadow_config import ShadowConfig, shadow_process
 from softloop.watch.config import FoxgloveConfig, LawGains, MonitorConfig, MonitorProcess, PageConfig, RecorderConfig
 from softloop.wire.benchfile import Table, load_model, read_toml, validated
 from softloop.wire.can_config import CanConfig
@@ -34,7 +35,7 @@ NAME = r"^[a-z0-9_-]{1,24}$"
 MAX_BASES = 8
 FIRST_PORT, PORTS = 20_000, 12_000
 # In the order in which they are started; any order works.
-PROCESS_NAMES = ("recorder", "monitor", "plant", "valves", "pressures", "inclinometer", "controller")
+PROCESS_NAMES = ("recorder", "monitor", "shadow", "plant", "valves", "pressures", "inclinometer", "controller")
 
 Key = tuple[str, ...]
 
@@ -57,6 +58,7 @@ class Bench(Table):
     controller: ControllerConfig | None = None
     recorder: RecorderConfig | None = None
     monitor: MonitorConfig | None = None
+    shadow: ShadowConfig | None = None
     page: PageConfig = PageConfig()
     foxglove: FoxgloveConfig = FoxgloveConfig()
     faults: FaultsConfig = FaultsConfig()
@@ -151,6 +153,10 @@ def process_config(bench: Bench, name: str) -> Any:
         if bench.pressures is None or bench.inclinometer is None:
             raise BadConfig("key 'valves': the gate needs the tables [pressures] and [inclinometer] too")
         return valves_process(table, bench.pressures, bench.inclinometer, bench.can)
+    if name == "shadow":
+        if bench.valves is None:
+            raise BadConfig("key 'shadow': the shadow follows the valve currents and needs the table [valves] too")
+        return shadow_process(table, bench.can[bench.valves.can].bitrate)
     if name == "monitor":
         if bench.controller is None:
             raise BadConfig("key 'monitor': the monitor needs the table [controller] too")

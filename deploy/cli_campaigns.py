@@ -44,6 +44,20 @@ def faults(
     return run_all(only or [], out, as_json=as_json)
 
 
+@app.command(epilog=EXIT_CODES)
+def parity(
+    run_a: Annotated[Path, typer.Argument(metavar="RUN_A", help="The run that is the measure: a directory, or a log in it.")],
+    run_b: Annotated[Path, typer.Argument(metavar="RUN_B", help="The run that is judged, of the same excitation.")],
+    bounds: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="Bounds; default: the shipped ones.")] = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the page and its pictures go.")] = Path("parity"),
+    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
+) -> int:
+    """Judge by bounds, channel by channel, whether two runs of one excitation are of one rig; exit code 1 where they are not."""
+    from softloop.deploy.parity import judge_parity
+
+    return judge_parity(run_a, run_b, bounds, out, as_json=as_json)
+
+
 @app.command()
 def tune(
     law: Annotated[str, typer.Argument(metavar="LAW", help="pid, pid_eso, smc, arc or arc_eso.")],

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from softloop.deploy.bench import Bench
 
 # In the order in which they are started, as in `deploy.bench`, which cannot be imported here.
-_TABLES = ("recorder", "monitor", "plant", "valves", "pressures", "inclinometer", "controller")
+_TABLES = ("recorder", "monitor", "shadow", "plant", "valves", "pressures", "inclinometer", "controller")
 _NAME = re.compile(r"[a-z0-9_-]{1,24}")
 LAUNCHER = "launcher"
 _OF_A_RUN = ("{run_dir}", "{port}")

@@ -38,6 +38,7 @@ class Process:
 _KNOWN = (
     Process("recorder", "softloop.watch.recorder", False, "SOURCE_RECORDER"),
     Process("monitor", "softloop.watch.monitor", False, "SOURCE_MONITOR"),
+    Process("shadow", "softloop.plant.shadow_process", False, "SOURCE_SHADOW"),
     Process("plant", "softloop.plant.process", True, "SOURCE_PLANT"),
     Process("valves", "softloop.devices.valves", True, "SOURCE_GATE"),
     Process("pressures", "softloop.devices.pressures", True, "SOURCE_PRESSURES"),
@@ -46,9 +47,9 @@ _KNOWN = (
 )
 PROCESSES = tuple(sorted(_KNOWN, key=lambda process: PROCESS_NAMES.index(process.name)))
 # Together in each group. The gate vents while the plant still runs, and the recorder sees all of it.
-KEPT_PROCESSES = ("recorder", "monitor")  # those that only listen: brought back when they die
+KEPT_PROCESSES = ("recorder", "monitor", "shadow")  # those that only listen: brought back when they die
 WALL_PACE_ONLY = ("monitor",)  # its word would come at another tick each time; `softloop log invariants` says the same of a log
-STOP_ORDER = (("controller",), ("valves",), ("pressures", "inclinometer", "plant", "monitor"), ("recorder",))
+STOP_ORDER = (("controller",), ("valves",), ("pressures", "inclinometer", "plant", "monitor", "shadow"), ("recorder",))
 
 
 def processes_of(bench: Bench) -> tuple[Process, ...]:

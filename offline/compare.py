@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from softloop.offline.compare_figures import Shown, distribution, lateness, tracking
 from softloop.offline.log import Log
 from softloop.offline.metrics import SENSORS
-from softloop.offline.page import document, picture, text
+from softloop.offline.page import document, picture, table, text
 from softloop.offline.run_log import open_run
 from softloop.offline.summary import NONE, Value, shown, summarise
-from softloop.offline.vector import as_bytes, write
+from softloop.offline.vector import as_bytes, make_folder, write
 from softloop.wire.errors import BadConfig, BadFile
 
 PAGE = "compare.html"
@@ -79,10 +79,7 @@ def labels(paths: list[Path]) -> list[str]:
 def compare(paths: list[Path], folder: Path) -> Path:
     """Write `compare.html` and its pictures (SVG, PDF) into `folder`; returns the page. Raises BadConfig, BadFile."""
     runs = read_runs(paths)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadFile(f"{folder}: cannot be made: {error.strerror or error}") from None
+    make_folder(folder)
     pictures = []
     for name, caption, draw in PICTURES:
         drawn = draw([Shown(run.label, run.log) for run in runs])
@@ -102,12 +99,12 @@ def page_of(runs: list[Run], pictures: list[str]) -> str:
         f"<h1>{title}</h1>",
         f'<p class="lead">{text(", ".join(run.label for run in runs))}</p>',
         *_warnings(runs),
-        _table(["figure", *(run.label for run in runs)], _figure_rows(runs)),
+        table(["figure", *(run.label for run in runs)], _figure_rows(runs)),
         '<p class="lead">Bold: the best of its row, where less is better and they are not the same.</p>',
         "<h2>Pictures</h2>",
         *pictures,
         "<h2>What differs in their set-up</h2>",
-        _set_up(runs),
+        set_up_table([run.label for run in runs], [run.log for run in runs]),
     ]
     return document(title, parts)
 
@@ -144,21 +141,13 @@ def best_of(values: list[Value]) -> float | None:
     return min(numbers) if len(numbers) > 1 and min(numbers) < max(numbers) else None
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    """Rows of cells that are markup already; the heads are text."""
-    titles = "".join(f"<th{'' if i == 0 else ' class=value'}>{text(title)}</th>" for i, title in enumerate(head))
-    body = "".join(
-        f"<tr><td>{text(name)}</td>{''.join(f'<td class=value>{cell}</td>' for cell in cells)}</tr>" for name, *cells in rows
-    )
-    return f"<table><tr>{titles}</tr>{body}</table>"
-
-
-def _set_up(runs: list[Run]) -> str:
-    found = differences([set_up(run.log) for run in runs])
+def set_up_table(names: list[str], logs: list[Log]) -> str:
+    """What differs in the set-up of runs, as markup."""
+    found = differences([set_up(log) for log in logs])
     if not found:
         return '<p class="lead">Nothing: bench file, parameters, versions and commit are the same.</p>'
     rows = [[key, *(f'<span class="key">{text(value)}</span>' for value in values)] for key, values in found]
-    return _table(["key", *(run.label for run in runs)], rows)
+    return table(["key", *names], rows)
 
 
 def set_up(log: Log) -> dict[str, str]:

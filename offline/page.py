@@ -57,3 +57,12 @@ def picture(caption: str, svg: bytes) -> str:
     """A picture in the page, as vectors, with its caption."""
     image = f'<img alt="{text(caption)}" src="data:image/svg+xml;base64,{base64.b64encode(svg).decode()}">'
     return f"<figure>{image}<figcaption>{text(caption)}</figcaption></figure>"
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    """Rows of cells that are markup already, but for the first of each; the heads are text."""
+    titles = "".join(f"<th{'' if i == 0 else ' class=value'}>{text(title)}</th>" for i, title in enumerate(head))
+    body = "".join(
+        f"<tr><td>{text(name)}</td>{''.join(f'<td class=value>{cell}</td>' for cell in cells)}</tr>" for name, *cells in rows
+    )
+    return f"<table><tr>{titles}</tr>{body}</table>"

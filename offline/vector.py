@@ -44,3 +44,12 @@ def write(target: Path, data: bytes) -> None:
         target.write_bytes(data)
     except OSError as error:
         raise BadFile(f"{target}: cannot be written: {error.strerror or error}") from None
+
+
+def make_folder(folder: Path) -> Path:
+    """Make a folder for figures and pages, where it is not there yet. Raises BadFile with one line."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadFile(f"{folder}: cannot be made: {error.strerror or error}") from None
+    return folder

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -72,35 +72,52 @@ class FaultConfig(Table):
         return self
 
 
-class PlantConfig(ProcessTable):
-    """`[plant]`: which rig is simulated, and on which wires."""
+class SpecimenConfig(ProcessTable):
+    """The keys that `[plant]` and `[shadow]` share: which specimen of a rig is simulated, and with which sensors."""
 
     layer: Literal["ideal", "rig"] = Field("rig", description="ideal: the controller's own model; rig: also what that leaves out")
     seed: int = Field(1, ge=0, description="which specimen of a rig, and its noise")
     parameters: str = Field("table1", description="parameter file about which the rig is drawn: a path, or a shipped name")
     step_us: int = Field(400, ge=10, le=1000, description="longest integration step; pieces between events are shorter")
+    supply_sensor: SensorConfig = SensorConfig()
+    chamber_sensor: SensorConfig = SensorConfig()
+    supply_kpa: float | None = Field(None, gt=20, le=240, description="what the supply is set to, gauge; default: drawn by seed")
+    tank_ml: float = Field(0.0, ge=0, le=20_000, description="a rigid, isothermal tank on the port, not the actuator; 0: none")
+    ambient_c: float | None = Field(None, ge=-20, le=60, description="of room, air and silicone; default: drawn by seed")
+    pressure_rise_ms: float = Field(3.0, ge=0, description="10 to 90 % of the sensors; none in the ideal layer")
+    bandwidth_hz: int = Field(256, description="of the inclinometer as it leaves the shelf")
+    command_delay_ms: float = Field(0.0, ge=0, le=1000, description="added to the wire to the driver, for latency studies")
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if 0.0 < self.tank_ml < LEAST_TANK_ML:
+            raise ValueError(f"tank_ml must be 0 or at least {LEAST_TANK_ML:g}: its tubing alone has 10 ml")
+        _check_device("bandwidth_hz", self.bandwidth_hz, BANDWIDTH_CODES)
+        return self
+
+
+def _check_device(name: str, value: int, codes: Collection[int]) -> None:
+    if value not in codes:
+        raise ValueError(f"{name} must be one of {', '.join(map(str, codes))}")
+
+
+class PlantConfig(SpecimenConfig):
+    """`[plant]`: which rig is simulated, and on which wires."""
 
     can_valves: str = Field("can0", description="which [can.NAME] the simulated valve driver is on")
     can_analog: str = Field("can0", description="which [can.NAME] the simulated analogue module is on")
     serial: str = Field("pty://{run_dir}/inclinometer", description="where the inclinometer's bytes go, a pyserial URL")
     baud: int = Field(115_200, description="of the inclinometer as it leaves the shelf")
     rate_hz: int = Field(200, description="of the inclinometer as it leaves the shelf")
-    bandwidth_hz: int = Field(256, description="of the inclinometer as it leaves the shelf")
 
-    supply_sensor: SensorConfig = SensorConfig()
-    chamber_sensor: SensorConfig = SensorConfig()
-    supply_kpa: float | None = Field(None, gt=20, le=240, description="what the supply is set to, gauge; default: drawn by seed")
-    tank_ml: float = Field(0.0, ge=0, le=20_000, description="a rigid, isothermal tank on the port, not the actuator; 0: none")
-    ambient_c: float | None = Field(None, ge=-20, le=60, description="of room, air and silicone; default: drawn by seed")
     pressure_noise_kpa: float = Field(0.1, ge=0, description="standard deviation of a pressure reading's noise")
-    pressure_rise_ms: float = Field(3.0, ge=0, description="10 to 90 % of the sensors; none in the ideal layer")
     angle_noise_deg: float = Field(0.05, ge=0, description="likewise of the inclinometer's angle")
     rate_noise_deg_s: float = Field(0.1, ge=0, description="likewise of its rate")
     coil_noise_ma: float = Field(0.05, ge=0, description="likewise of the coil currents that the driver measures")
 
     vent_current_ma: float = Field(200.0, ge=0, description="exhaust current of the driver's own vent")
+    dump_valve: bool = Field(False, description="a normally-open valve that vents the chamber when the driver has no power")
     watchdog_ms: float = Field(20.0, gt=0, description="the driver vents by itself after this time without a good frame")
-    command_delay_ms: float = Field(0.0, ge=0, le=1000, description="added to the wire to the driver, for latency studies")
     measurement_delay_ms: float = Field(0.0, ge=0, le=1000, description="added to the wires from the sensors and the driver")
 
     loads: tuple[LoadConfig, ...] = Field((), max_length=16, description="payloads and contacts, each a [[plant.loads]]")
@@ -108,15 +125,11 @@ class PlantConfig(ProcessTable):
     faults_from: Literal["start", "armed"] = Field(
         "start", description="what the times of faults count from: the plant's start, or the gate's arming (wall pace)"
     )
-    dump_valve: bool = Field(False, description="a normally-open valve that vents the chamber when the driver has no power")
 
     @model_validator(mode="after")
-    def _known_device_settings(self) -> PlantConfig:
-        if 0.0 < self.tank_ml < LEAST_TANK_ML:
-            raise ValueError(f"tank_ml must be 0 or at least {LEAST_TANK_ML:g}: its tubing alone has 10 ml")
-        for name, codes in (("baud", BAUD_CODES), ("rate_hz", RATE_CODES), ("bandwidth_hz", BANDWIDTH_CODES)):
-            if getattr(self, name) not in codes:
-                raise ValueError(f"{name} must be one of {', '.join(map(str, codes))}")
+    def _known_device_settings(self) -> Self:
+        _check_device("baud", self.baud, BAUD_CODES)
+        _check_device("rate_hz", self.rate_hz, RATE_CODES)
         return self
 
 

@@ -11,7 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softloop.wire.channels import CAN, CAN_BUS, CYCLE, EVENT, PRESSURE, STATUS, VALVES, WATERMARK, Channel, channel_of_key
+from softloop.wire.channels import (
+    CAN,
+    CAN_BUS,
+    CYCLE,
+    EVENT,
+    PRESSURE,
+    SHADOW,
+    STATUS,
+    VALVES,
+    WATERMARK,
+    Channel,
+    channel_of_key,
+)
 from softloop.wire.messages import BadPayload, constant, message, names_of
 
 RATE_WINDOW_S = 2.0
@@ -22,7 +34,7 @@ _PLANT, _KIND_FAULT = constant("Event", "SOURCE_PLANT"), constant("Event", "KIND
 _STARTING = constant("ProcessStatus", "STATE_STARTING")
 _NODES = {number: name.replace("_", " ") for number, name in names_of("CanBusStatus", "NODE_").items()}
 _BUS_STATES = {number: name.replace("_", " ") for number, name in names_of("CanBusStatus", "STATE_").items()}
-_KEPT = {CYCLE.name, VALVES.name, PRESSURE.name}
+_KEPT = {CYCLE.name, VALVES.name, PRESSURE.name, SHADOW.name}
 FrameTime = Callable[[int, int], int]  # data bytes, bit/s -> ns on the bus
 
 

@@ -43,9 +43,10 @@ TRUTH = Channel("truth", "PlantTruth", 200.0)
 STATUS = Channel("status", "ProcessStatus", 1.0)
 CAN_BUS = Channel("canbus", "CanBusStatus", 0.0)  # of each emulated CAN bus, ten times a second
 CLOCK = Channel("clock", "ClockOffset", 10.0)  # with several hosts: from each but that of the controller
+SHADOW = Channel("shadow", "ShadowDivergence", 20.0)  # where the bench has a [shadow]
 CAN = Channel("can", "CanFrame", 600.0, realtime=True)  # key: can/<bus>/<arbitration id in hex>
 
-CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, ARM, EVENT, CYCLE, TRUTH, STATUS, CAN_BUS, CLOCK, CAN)
+CHANNELS = (PRESSURE, INCLINATION, COMMAND, VALVES, REQUEST, ARM, EVENT, CYCLE, TRUTH, STATUS, CAN_BUS, CLOCK, SHADOW, CAN)
 
 # Asked for and answered, not published (`wire.questions`): a fault for the simulated rig, answered by the plant alone.
 FAULT = Channel("fault", "FaultRequest", 0.0, logged=False)

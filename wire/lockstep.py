@@ -41,14 +41,15 @@ from softloop.wire.session import Inbox, Wire
 from softloop.wire.shell import Stop
 
 PLANT, CONTROLLER, VALVES, RECORDER, LAUNCHER = "plant", "controller", "valves", "recorder", "launcher"
+LISTENERS = (RECORDER, "shadow")  # the plant does not run far ahead of them
 # Times `timeout_s` that is waited for whom: the farther along the chain of a tick, the longer.
 PATIENCE = {CONTROLLER: 1.25, VALVES: 1.5, RECORDER: 1.5, PLANT: 2.0}
 _TICK, _WATERMARK = message("Tick"), message("Watermark")
 _WIRES, _PIECES = constant("Tick", "WIRES"), constant("Tick", "PIECES")
 _HELLO_S = 0.02
 _LOOK_S = 0.05  # how often a waiting process looks whether it has been asked to stop
-# How far the plant may be ahead of the recorder: 14 messages a tick, far fewer than its backlog holds.
-RECORDER_TICKS = 200
+# How far the plant may be ahead of a listener: 14 messages a tick, far fewer than its backlog holds.
+LISTENER_TICKS = 200
 
 
 class RigClock:
@@ -120,8 +121,7 @@ class Board:
 
     def done(self, process: str) -> int:
         """How many ticks a followed process is done with."""
-        mark = self.marks.get(process)
-        return 0 if mark is None else int(mark.tick)
+        return int(self.marks[process].tick) if process in self.marks else 0
 
     def wait(
         self,
@@ -201,10 +201,6 @@ class Lockstep(Pace):
         )
         self._put[channel.name](_WATERMARK.pack(mark))
 
-    def hello(self) -> None:
-        """Say that this process is there."""
-        self.say(HELLO)
-
     def meet(self, wanted: Collection[str], meanwhile: Callable[[], None] | None) -> bool:
         """Until each of `wanted` has said hello; False when asked to stop. Raises Lost, naming who is missing."""
         present = self.board.present
@@ -243,15 +239,15 @@ class Leader(Lockstep):
         super().__init__(config, wire, stop, others)
         self.rig_clock.on_sleep = self._end_tick
         self._put_tick = self._publisher(wire, TICK)
-        self.board.follow(VALVES)
-        self.board.follow(RECORDER)
+        for process in (VALVES, *LISTENERS):
+            self.board.follow(process)
         self.target_ns = START_NS  # the rig clock of the tick in hand, once the frames of the last one are taken
         self._tick = self._ticks = 0
         self._pieces: list[list[tuple[int, int]]] = [[] for _ in range(_WIRES)]
         self._on_wire = [0] * _WIRES
 
     def begin(self) -> None:
-        if self.meet([*self.others, LAUNCHER], self.hello):
+        if self.meet([*self.others, LAUNCHER], lambda: self.say(HELLO)):
             self._ticks = int(self.board.present[LAUNCHER].ticks)
 
     def note_piece(self, wire: int, amount: int, arrival_ns: int) -> None:
@@ -266,8 +262,8 @@ class Leader(Lockstep):
         self._announce(last)
         done = self._tick + 1
         self.board.wait_done(VALVES, done)
-        if RECORDER in self.others:
-            self.board.wait_done(RECORDER, done - RECORDER_TICKS)
+        for process in (p for p in LISTENERS if p in self.others):
+            self.board.wait_done(process, done - LISTENER_TICKS)
         if last:
             self.end()
         self._tick += 1
@@ -301,15 +297,15 @@ class Follower(Lockstep):
         self._inputs: list[tuple[str, int]] = []
 
     def begin(self) -> None:
-        self.hello()
-        self.meet(self.others, self.hello)
+        self.say(HELLO)
+        self.meet(self.others, lambda: self.say(HELLO))
 
     def keep_up(self, take: Callable[[], object]) -> None:
         newest = self.board.tick
         all_ended = self.board.ended.keys() >= set(self.others)
         take()
         if newest is None:
-            self.hello()
+            self.say(HELLO)
         else:
             self.say(WATERMARK, int(newest.tick) + 1)
         if all_ended:
@@ -334,7 +330,7 @@ class Follower(Lockstep):
         there = self.board.wait(
             lambda: self.board.tick is not None and self.board.tick.seq > after,
             lambda: f"'{PLANT}'",
-            None if after else self.hello,
+            None if after else lambda: self.say(HELLO),
             PATIENCE[PLANT],
         )
         if there:
@@ -392,7 +388,10 @@ class Follower(Lockstep):
     def requests(self, source: Inbox) -> Requests:
         return PacedRequests(self, source)
 
-    def newest(self, source: Newest, process: str, lag: int = 0) -> Newest:
+    def hear_out(self, process: str, lag: int = 0) -> None:
         self.board.follow(process)
         self._inputs.append((process, lag))
+
+    def newest(self, source: Newest, process: str, lag: int = 0) -> Newest:
+        self.hear_out(process, lag)
         return PacedNewest(self, source, process)

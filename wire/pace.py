@@ -93,6 +93,9 @@ class Pace:
         """An input of the controller; at lockstep that of the tick, or of `lag` ticks before, by `process`."""
         return source
 
+    def hear_out(self, process: str, lag: int = 0) -> None:
+        """At lockstep: the clock's sleep ends once all that `process` said on the tick is here; nobody waits for this one."""
+
     def note_sent(self, stamp_ns: int) -> None:
         """The gate has put a valve frame on the bus."""
 

@@ -25,6 +25,7 @@ from softloop.wire.channels import (
     PRESSURE,
     REQUEST,
     ROOT,
+    SHADOW,
     STATUS,
     TIME,
     TRUTH,
@@ -35,6 +36,7 @@ from softloop.wire.channels import (
 RECORDER, MONITOR, PLANT, GATE, PRESSURES, INCLINOMETER, CONTROLLER = (
     "recorder", "monitor", "plant", "valves", "pressures", "inclinometer", "controller",
 )  # fmt: skip
+FOLLOWING = "shadow"  # the simulated plant that follows a rig
 LAUNCHER = "launcher"  # the one that leads, or the only one
 FOLLOWER = "follower"  # the launcher of every other host, `launcher-<host>` on the wire
 ROUTER = "router"  # whoever is the meeting point
@@ -97,6 +99,7 @@ RIGHTS = {
     ),
     RECORDER: Rights(puts=_TELL, hears=(ALL,)),
     MONITOR: Rights(puts=(REQUEST.name, *_TELL), hears=(CYCLE.name, *_HEAR)),
+    FOLLOWING: Rights(puts=(SHADOW.name, *_TELL), hears=(PRESSURE.name, INCLINATION.name, *_HEAR)),
     LAUNCHER: Rights(puts=(REQUEST.name, ARM.name, EVENT.name, CLOCK.name), hears=_WATCH),
     FOLLOWER: Rights(puts=(REQUEST.name, EVENT.name, CLOCK.name), hears=_WATCH),
     ROUTER: Rights(puts=(ALL,), hears=(ALL,), asks=(ALL,), answers=(ALL,)),

@@ -28,7 +28,7 @@ FIRST = ["run", "sim", "--page", "--run-dir", "runs/first"]
 SECOND = ["run", "pid.toml", "--run-dir", "runs/second"]
 BESIDE = ("top", "echo", "page", "foxglove", "request")
 ON_LOGS = ("plot", "report", "compare", "replay", "keys")
-ELSEWHERE = ("doctor", "install", "log")  # in tests of their own
+ELSEWHERE = ("doctor", "install", "log", "parity")  # in tests of their own
 STANDS_FOR = {"runs/<run>": "runs/first", "runs/RUN": "runs/first", "runs/RUN_A": "runs/first", "runs/RUN_B": "runs/second"}
 # What is long in the documentation is short here: these words are added, or stand in for others.
 LESS = {

@@ -56,7 +56,7 @@ def test_a_run_starts_vented_tracks_logs_everything_and_leaves_nothing_behind(sh
         assert list(rig.folder.glob("*.sock*")) == []
         log = open_log(rig.run_dir / "run.mcap")
         assert log.problems == []
-        spoken = {c.name for c in CHANNELS if c.logged and c.name not in ("can", "canbus", "clock")}
+        spoken = {c.name for c in CHANNELS if c.logged and c.name not in ("can", "canbus", "clock", "shadow")}
         assert {name for name in spoken if len(log[name])} == spoken
         assert {f"{arbitration_id:x}" for _, arbitration_id in log.can} == {"80", "90", "100"}
         assert {"bench.toml", "rig.dbc", "parameters.toml"} <= set(log.attachments)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from softloop.watch.overview import LATE_EDGES_US, Overview
-from softloop.wire.channels import CAN, VALVES
+from softloop.wire.channels import CAN, SHADOW, VALVES
 from softloop.wire.messages import names_of
 
 FRESH_S = 1.0
@@ -61,6 +61,9 @@ def state_of(overview: Overview, now_s: float | None = None) -> dict[str, Any]:
     }
     if valves is not None:
         found["coils"] = {"charge_ma": valves.charge_coil_ma, "exhaust_ma": valves.exhaust_coil_ma}
+    shadow = overview.newest.get(SHADOW.name)
+    if shadow is not None:
+        found["shadow"] = {name: getattr(shadow, name) for name in ("angle_rms_deg", "chamber_rms_kpa")}
     if cycle is not None:
         found["cycle"] = {name: getattr(cycle, name) for name in _NUMBERS}
         found["phase"] = _PHASES.get(cycle.phase, "?")

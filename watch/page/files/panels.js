@@ -18,6 +18,7 @@ const NUMBERS = [
   ["working mode", (s) => s.mode ?? "-"],
   ["gate's output", (s) => s.gate.output],
   ["valve driver", (s) => s.gate.driver],
+  ["off the shadow, RMS", (s) => (s.shadow ? `${fixed(s.shadow.angle_rms_deg, 2, " deg")}, ${fixed(s.shadow.chamber_rms_kpa, 2, " kPa")}` : "-")],
   ["ticks skipped", (s) => (s.cycle ? `${s.cycle.skipped_total}` : "-")],
 ];
 
