@@ -45,3 +45,21 @@ def canopen_configure(bench: BenchArgument) -> int:
     from softloop.deploy.device_setup import configure_canopen
 
     return configure_canopen(bench)
+
+
+@app.command()
+def calibrate(
+    bench: BenchArgument,
+    output: Annotated[Path, typer.Option(metavar="FILE.toml", help="The piece of a bench file to write, or to go on with.")],
+    supply_vented: Annotated[bool, typer.Option("--supply-vented", help="At rest: nothing is on the supply sensor either.")] = False,
+    rest_deg: Annotated[float | None, typer.Option(metavar="DEG", help="At rest: the bending angle is this.")] = None,
+    chamber_kpa: Annotated[float | None, typer.Option(metavar="KPA", help="A known point: on the chamber, by a manometer.")] = None,
+    supply_kpa: Annotated[float | None, typer.Option(metavar="KPA", help="A known point: on the supply.")] = None,
+    bent_deg: Annotated[float | None, typer.Option(metavar="DEG", help="A known point: bent by hand to this angle.")] = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.5, max=600.0, help="For each thing that is listened to.")] = 5.0,
+) -> int:
+    """Zero of the sensors with the rig vented and at rest, gain and sign at a known point. Nothing is sent to a device."""
+    from softloop.deploy.calibrate import Known
+    from softloop.deploy.calibrate import calibrate as measure
+
+    return measure(bench, output, Known(supply_vented, rest_deg, chamber_kpa, supply_kpa, bent_deg), seconds)
