@@ -195,6 +195,8 @@ def _check_lockstep(bench: Bench, source: Source) -> None:
             f"{source.file}: key 'pace.mode': lockstep needs the tables [plant], [valves] and [controller]: "
             "real devices do not wait for a tick"
         )
+    if bench.valves.driver != "rig":
+        raise BadConfig(f"{source.file}: key 'valves.driver': must be \"rig\" at lockstep pace, as the simulated driver is one")
     if bench.plant.faults_from != "start":
         raise BadConfig(f"{source.file}: key 'plant.faults_from': must be \"start\" at lockstep pace, where arming is planned")
     late = next((i.kind for i in bench.faults.injections if i.needs_wall), None)

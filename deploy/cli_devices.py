@@ -51,9 +51,13 @@ def canopen_configure(bench: BenchArgument) -> int:
 def calibrate(
     bench: BenchArgument,
     output: Annotated[Path, typer.Option(metavar="FILE.toml", help="The piece of a bench file to write, or to go on with.")],
-    supply_vented: Annotated[bool, typer.Option("--supply-vented", help="At rest: nothing is on the supply sensor either.")] = False,
+    supply_vented: Annotated[
+        bool, typer.Option("--supply-vented", help="At rest: nothing is on the supply sensor either.")
+    ] = False,
     rest_deg: Annotated[float | None, typer.Option(metavar="DEG", help="At rest: the bending angle is this.")] = None,
-    chamber_kpa: Annotated[float | None, typer.Option(metavar="KPA", help="A known point: on the chamber, by a manometer.")] = None,
+    chamber_kpa: Annotated[
+        float | None, typer.Option(metavar="KPA", help="A known point: on the chamber, by a manometer.")
+    ] = None,
     supply_kpa: Annotated[float | None, typer.Option(metavar="KPA", help="A known point: on the supply.")] = None,
     bent_deg: Annotated[float | None, typer.Option(metavar="DEG", help="A known point: bent by hand to this angle.")] = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.5, max=600.0, help="For each thing that is listened to.")] = 5.0,

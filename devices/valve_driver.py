@@ -125,7 +125,9 @@ class CanopenDriver:
 
     def frames(self, output: int, charge_counts: int, exhaust_counts: int, seq: int) -> Frames:
         plan, scale = self.plan, self.plan.scale
-        data = co.encode_setpoints(scale.counts(counts_to_current(charge_counts)), scale.counts(counts_to_current(exhaust_counts)))
+        data = co.encode_setpoints(
+            scale.counts(counts_to_current(charge_counts)), scale.counts(counts_to_current(exhaust_counts))
+        )
         made = [(plan.setpoint_id, data)]
         if seq % self._heartbeat_frames == 0:
             made.append((plan.gate_heartbeat_id, bytes((co.OPERATIONAL,))))

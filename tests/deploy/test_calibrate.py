@@ -117,7 +117,12 @@ def test_rest_and_a_known_point_at_once_are_refused(folder, capsys):
         ('pieces = ["c.toml"]\n', None, BadFile, "key 'pieces': there is no file"),
         ('pieces = "c.toml"\n', "", BadConfig, "must be a list of file names in quotes"),
         ('pieces = ["c.toml"]\n', 'base = "x.toml"\n', BadConfig, "c.toml: key 'base': a piece has none"),
-        ('pieces = ["c.toml"]\n', "[pressures.chamber]\nzero_w = 1\n", BadConfig, r"c.toml: unknown key 'pressures.chamber.zero_w'"),
+        (
+            'pieces = ["c.toml"]\n',
+            "[pressures.chamber]\nzero_w = 1\n",
+            BadConfig,
+            r"c.toml: unknown key 'pressures.chamber.zero_w'",
+        ),
         ('pieces = ["c.toml"]\n', "[pressures", BadFile, "c.toml"),
     ],
 )

@@ -15,7 +15,7 @@ from softloop.wire.can_config import CanConfig, open_port
 from softloop.wire.clock import WallClock
 from softloop.wire.errors import Unavailable
 from softloop.wire.messages import constant
-from tests.devices.adapters import bench, run_to_its_end, running, until
+from tests.devices.adapters import bench, run_to_its_end, running
 from tests.devices.canopen_module import OPERATIONAL, STOPPED, Module
 from tests.devices.gate_bench import process
 from tests.devices.test_valves import Rig
@@ -137,7 +137,9 @@ def test_a_node_that_would_not_vent_by_itself_is_not_used(meet, tmp_path):
     assert "\n" not in said
 
 
-@pytest.mark.parametrize(("lacks", "name"), [(0x1016, "1016h:01"), (0x1029, "1029h:01"), (0x6443, "6443h:03"), (0x6444, "6444h:03")])
+@pytest.mark.parametrize(
+    ("lacks", "name"), [(0x1016, "1016h:01"), (0x1029, "1029h:01"), (0x6443, "6443h:03"), (0x6444, "6444h:03")]
+)
 def test_a_node_without_an_object_that_makes_it_safe_is_refused(meet, tmp_path, lacks, name):
     given = config()
     with canopen_rig(meet, given, without=(lacks,)) as rig:

@@ -104,8 +104,14 @@ def test_no_frame_breaks_the_adapter_and_only_an_operational_heartbeat_is_well(a
         ({"canopen_analog": {"low_counts": 32767}}, "full_counts must be above low_counts .32767."),
         ({"canopen_current": {"low_ma": 650}}, "full_ma must be above low_ma .650."),
         ({"canopen_analog": {"off_counts": 5}}, r"off_counts must be low_counts \(0\) or outside"),
-        ({"driver": "canopen_analog", "canopen_analog": {"full_ma": 200}}, "current_max_ma must be at most canopen_analog.full_ma"),
-        ({"driver": "canopen_analog", "canopen_analog": {"low_ma": 210}}, "vent_current_ma must be a current that canopen_analog"),
+        (
+            {"driver": "canopen_analog", "canopen_analog": {"full_ma": 200}},
+            "current_max_ma must be at most canopen_analog.full_ma",
+        ),
+        (
+            {"driver": "canopen_analog", "canopen_analog": {"low_ma": 210}},
+            "vent_current_ma must be a current that canopen_analog",
+        ),
         ({"driver": "canopen_current", "canopen_current": {"deadline_ms": 50}}, "canopen_current.deadline_ms is too long"),
         ({"driver": "canopen_current", "canopen_current": {"heartbeat_ms": 25}}, "canopen_current.heartbeat_ms is too long"),
     ],
