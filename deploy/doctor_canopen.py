@@ -1,4 +1,4 @@
-"""What the doctor says of a CANopen node that drives the valves: whether it would vent by itself. Its objects are read, none written."""
+"""What the doctor says of a CANopen node that drives the valves: whether it would vent by itself. It is read, never written."""
 
 from __future__ import annotations
 

@@ -6,13 +6,12 @@ here judges: an adapter turns counts of 0.01 mA into a device's bytes, and a dev
 
 from __future__ import annotations
 
-import struct
 from typing import Protocol
 
 from softloop.devices.config import PERIOD_NS, ValvesProcess
 from softloop.devices.protocols import can_frames
 from softloop.devices.protocols import canopen_output as co
-from softloop.devices.protocols.quantise import COUNTS_MAX, counts_to_current, current_to_counts
+from softloop.devices.protocols.quantise import counts_to_current, current_to_counts
 from softloop.wire.can_frame import CanFrame
 from softloop.wire.can_port import CanPort
 from softloop.wire.clock import Clock
@@ -35,8 +34,10 @@ class ValveDriver(Protocol):
     """
 
     receive: tuple[int, ...]
-    rejected: int
     coils: tuple[int, int]
+
+    @property
+    def rejected(self) -> int: ...
 
     def prepare(self, port: CanPort, clock: Clock) -> None:
         """Before the first step: see that the device is as it must be. Raises Unavailable, Lost."""
@@ -60,7 +61,7 @@ def make_driver(config: ValvesProcess) -> ValveDriver:
 class RigDriver:
     """The rig's own driver: frames of `rig.dbc`, with counter and CRC both ways."""
 
-    receive = (can_frames.VALVE_STATUS_ID,)
+    receive: tuple[int, ...] = (can_frames.VALVE_STATUS_ID,)
 
     def __init__(self, max_lost: int) -> None:
         self._judge = can_frames.E2eReceiver(can_frames.VALVE_STATUS_ID, max_lost)
@@ -102,7 +103,7 @@ class CanopenDriver:
 
     def __init__(self, plan: co.NodePlan) -> None:
         self.plan = plan
-        self.receive = (plan.heartbeat_id, plan.emergency_id, plan.measured_id, plan.sdo_answer_id)
+        self.receive: tuple[int, ...] = (plan.heartbeat_id, plan.emergency_id, plan.measured_id, plan.sdo_answer_id)
         self.rejected = 0
         self.coils = (NOT_MEASURED, NOT_MEASURED)
         self.restarted = False
@@ -151,6 +152,5 @@ class CanopenDriver:
         return None
 
     def _measured(self, data: bytes) -> tuple[int, int]:
-        charge, exhaust = struct.unpack("<hh", data)
-        scale = self.plan.scale
-        return tuple(min(COUNTS_MAX, current_to_counts(scale.current_ma(c))) for c in (charge, exhaust))  # type: ignore[return-value]
+        charge, exhaust = (current_to_counts(self.plan.scale.current_ma(counts)) for counts in co.decode_setpoints(data))
+        return charge, exhaust

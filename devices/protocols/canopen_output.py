@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 NMT_ID = 0x000
 EMERGENCY_BASE, HEARTBEAT_BASE = 0x080, 0x700
@@ -53,7 +52,8 @@ class Scale:
         return self.low_ma + (counts - self.low_counts) / (self.full_counts - self.low_counts) * (self.full_ma - self.low_ma)
 
 
-class Setting(NamedTuple):
+@dataclass(frozen=True)
+class Setting:
     """One object that must hold a value. `size` in bytes; a negative value is two's complement."""
 
     index: int
@@ -185,6 +185,6 @@ def _mapping(index: int, mapped: int, outputs: Sequence[int], what: str) -> list
 
 def writing_order(settings: Sequence[Setting]) -> list[Setting]:
     """The same as they are to be written: a PDO is changed while it is off and its mapping while it is empty (CiA 301)."""
-    off = [s._replace(value=s.value | PDO_OFF, what=f"{s.what}, off") for s in settings if s.is_identifier]
-    empty = [s._replace(value=0, what=f"{s.what}, none") for s in settings if s.is_length]
+    off = [replace(s, value=s.value | PDO_OFF, what=f"{s.what}, off") for s in settings if s.is_identifier]
+    empty = [replace(s, value=0, what=f"{s.what}, none") for s in settings if s.is_length]
     return [*off, *empty, *settings]
