@@ -1,7 +1,9 @@
 """The bench file: all tables of a rig in one model, with errors that name the key, the file and what is allowed.
 
-Two keys at the top make one bench out of another. `base = "sim.toml"` takes over the tables of that file (found beside this
+Three keys at the top make one bench out of another. `base = "sim.toml"` takes over the tables of that file (found beside this
 one); what stands in this file replaces key by key what stands there. `without = ["plant"]` leaves out tables of the base.
+`pieces = ["calibration.toml"]` takes over what stands in files of keys alone, such as `softloop calibrate` writes: over the
+base, and under what stands in this file.
 In every text value `{run_dir}` means the run directory, `{port}` a TCP port that follows from it, so that runs side by side
 do not meet on one, and `{bench_dir}` the folder of the file the text stands in.
 """
@@ -106,6 +108,8 @@ def read_source(path: Path, run_dir: Path | None = None) -> Source:
         for name in own.pop("without", []):
             _remove(content, origins, name, file)
         own.pop("base", None)
+        for piece, keys in _pieces_of(file, own.pop("pieces", [])):
+            _merge(content, origins, _substituted(keys, piece, run_dir), piece, ())
         _merge(content, origins, _substituted(own, file, run_dir), file, ())
     return Source(path, content, origins, run_dir)
 
@@ -215,6 +219,8 @@ def _check_lockstep(bench: Bench, source: Source) -> None:
             f"{source.file}: key 'pace.mode': lockstep needs the tables [plant], [valves] and [controller]: "
             "real devices do not wait for a tick"
         )
+    if bench.valves.driver != "rig":
+        raise BadConfig(f"{source.file}: key 'valves.driver': must be \"rig\" at lockstep pace, as the simulated driver is one")
     if bench.plant.faults_from != "start":
         raise BadConfig(f"{source.file}: key 'plant.faults_from': must be \"start\" at lockstep pace, where arming is planned")
     late = next((i.kind for i in bench.faults.injections if i.needs_wall), None)
@@ -247,6 +253,23 @@ def _check_head(file: Path, own: dict[str, Any]) -> None:
     without = own.get("without", [])
     if not isinstance(without, list) or not all(isinstance(name, str) for name in without):
         raise BadConfig(f"{file}: key 'without': must be a list of table names in quotes (got {without!r})")
+
+
+def _pieces_of(file: Path, names: Any) -> list[tuple[Path, dict[str, Any]]]:
+    """The pieces that a file names, each with its content. Raises BadFile, BadConfig."""
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise BadConfig(f"{file}: key 'pieces': must be a list of file names in quotes (got {names!r})")
+    found = []
+    for name in names:
+        piece = file.parent / name
+        if not piece.is_file():
+            raise BadFile(f"{file}: key 'pieces': there is no file {piece}")
+        keys = read_toml(piece)
+        head = sorted({"base", "without", "pieces"} & set(keys))
+        if head:
+            raise BadConfig(f"{piece}: key '{head[0]}': a piece has none")
+        found.append((piece, keys))
+    return found
 
 
 def _base_of(file: Path, own: dict[str, Any]) -> Path | None:

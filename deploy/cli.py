@@ -327,6 +327,7 @@ def prepare(bench: BenchArgument, run_dir: RunDir) -> int:
 
 # After these in the list of commands; each enters itself.
 import softloop.deploy.cli_campaigns  # noqa: E402
+import softloop.deploy.cli_devices  # noqa: E402
 import softloop.deploy.cli_experiments  # noqa: E402
 import softloop.deploy.cli_machine  # noqa: E402, F401
 

@@ -1,6 +1,6 @@
 """What the doctor says of a CAN bus: who speaks, how full it is, and whether driver and sensors say what a rig at rest says.
 
-Only listened to: nothing is sent.
+Only listened to: nothing is sent, but questions to a CANopen node (`doctor_canopen`).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from softloop.deploy.bench import Bench
+from softloop.deploy.doctor_canopen import own_vent, plan_on
 from softloop.deploy.doctor_check import Check, Verdict, judged, worst
 from softloop.devices.config import SensorConfig
 from softloop.devices.protocols import can_frames
@@ -61,14 +62,16 @@ def can_checks(bench: Bench, name: str, wire: Wire, clock: Clock, seconds: float
         port = open_port(config, name, wire, clock)
     except Unavailable as error:
         return [Check(f"CAN {name}", "fail", f"not there: {error}", _how_to_bring_up(config))]
+    plan = plan_on(bench, name)
     try:
         heard = listen(port, config.bitrate, clock, seconds)
+        asked = [own_vent(plan, port, clock)] if plan is not None else []
     except Lost as error:
         return [Check(f"CAN {name}", "fail", str(error), "look at the adapter and its cable")]
     finally:
         port.close()
-    checks = [answering(f"CAN {name}", heard, _expected_hz(bench, name)), load(f"CAN {name} load", heard, config.bitrate)]
-    if bench.valves is not None and bench.valves.can == name and heard.status:
+    checks = [answering(f"CAN {name}", heard, _expected_hz(bench, name)), load(f"CAN {name} load", heard, config.bitrate), *asked]
+    if bench.valves is not None and bench.valves.can == name and heard.status and plan is None:
         checks.append(driver(bench, heard))
     if bench.pressures is not None and bench.pressures.can == name and heard.analog:
         checks.append(at_rest(bench, heard.analog))
@@ -83,7 +86,10 @@ def _how_to_bring_up(config: CanConfig) -> str:
 
 def _expected_hz(bench: Bench, name: str) -> dict[str, tuple[int, float]]:
     expected = {}
-    if bench.valves is not None and bench.valves.can == name:
+    plan = plan_on(bench, name)
+    if plan is not None:
+        expected["valve driver"] = (plan.heartbeat_id, 1e3 / plan.heartbeat_ms)
+    elif bench.valves is not None and bench.valves.can == name:
         expected["valve driver"] = (can_frames.VALVE_STATUS_ID, VALVES.rate_hz)
     if bench.pressures is not None and bench.pressures.can == name:
         expected["analogue module"] = (can_frames.ANALOG_INPUTS_ID, bench.pressures.rate_hz)

@@ -8,6 +8,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
+from softloop.devices.driver_config import CanopenAnalogConfig, CanopenCurrentConfig
 from softloop.devices.protocols.analog import AnalogConfig
 from softloop.devices.protocols.quantise import COUNTS_MAX, MA_PER_COUNT
 from softloop.devices.protocols.wire_time import can_frame_ns, serial_ns
@@ -32,6 +33,11 @@ class ValvesConfig(ProcessTable):
     """`[valves]`: the safety gate and its valve driver."""
 
     can: str = Field("can0", description="which [can.NAME] the valve driver is on")
+    driver: Literal["rig", "canopen_analog", "canopen_current"] = Field(
+        "rig", description="rig: speaks rig.dbc; the others: a CANopen node, described in the table of that name"
+    )
+    canopen_analog: CanopenAnalogConfig = CanopenAnalogConfig()
+    canopen_current: CanopenCurrentConfig = CanopenCurrentConfig()
     current_max_ma: float = Field(220.0, gt=0, le=COUNTS_MAX * MA_PER_COUNT, description="above it a command is a fault")
     slew_ma_per_tick: float = Field(220.0, gt=0, description="a passed current changes at most this much in one tick")
     overlap_ma: float = Field(70.0, ge=0, description="one of the two currents is always held at or below this")
@@ -64,7 +70,23 @@ class ValvesConfig(ProcessTable):
             raise ValueError(f"vent_again_kpa must be below pressure_max_kpa ({self.pressure_max_kpa:g})")
         if self.angle_min_deg >= self.angle_max_deg:
             raise ValueError(f"angle_min_deg must be below angle_max_deg ({self.angle_max_deg:g})")
+        if self.node is not None:
+            self._agrees_with_node(self.node)
         return self
+
+    @property
+    def node(self) -> CanopenAnalogConfig | None:
+        """The CANopen node that drives the valves; None for the rig's own driver."""
+        return {"canopen_analog": self.canopen_analog, "canopen_current": self.canopen_current}.get(self.driver)
+
+    def _agrees_with_node(self, node: CanopenAnalogConfig) -> None:
+        if node.full_ma < self.current_max_ma:
+            raise ValueError(f"current_max_ma must be at most {self.driver}.full_ma ({node.full_ma:g})")
+        if node.plan(self.vent_current_ma).error_counts[1] == node.off_counts:
+            raise ValueError(f"vent_current_ma must be a current that {self.driver} can give (low_ma is {node.low_ma:g})")
+        for name, least_ms in (("deadline_ms", node.deadline_ms), ("heartbeat_ms", 2 * node.heartbeat_ms)):
+            if least_ms >= self.driver_silence_ms:
+                raise ValueError(f"{self.driver}.{name} is too long for driver_silence_ms ({self.driver_silence_ms:g})")
 
 
 class SensorConfig(Table):

@@ -21,7 +21,7 @@ FRAME = record_dtype(
         ("seq", "i8"),
         ("stamp_ns", "i8"),
         ("tick", "u8"),
-        ("charge_coil", "i8"),  # counts of the driver's last status frame
+        ("charge_coil", "i8"),  # counts that the driver measured last; below 0: it says none
         ("exhaust_coil", "i8"),
         ("rejected", "i8"),
     ]
@@ -48,8 +48,8 @@ def fill_status(frame: Any, given: Any, state: Any, output: Any, status: Any) ->
     status.command_seq = given.command_seq if answered else 0
     status.command_received_ns, status.driver_stamp_ns = given.command_received_ns, given.driver_stamp_ns
     status.charge_current_ma, status.exhaust_current_ma = output.charge_current_ma, output.exhaust_current_ma
-    status.charge_coil_ma = counts_to_current(frame.charge_coil)
-    status.exhaust_coil_ma = counts_to_current(frame.exhaust_coil)
+    status.charge_coil_ma = counts_to_current(frame.charge_coil) if frame.charge_coil >= 0 else np.nan
+    status.exhaust_coil_ma = counts_to_current(frame.exhaust_coil) if frame.exhaust_coil >= 0 else np.nan
     status.gate, status.output, status.reason, status.driver = output.gate, output.output, output.reason, output.driver
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import select
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from softloop.devices.config import InclinometerConfig
@@ -77,16 +79,33 @@ def _plain_descriptor(port: Any) -> int:
     return fd if stat.S_ISCHR(mode) or stat.S_ISSOCK(mode) else -1
 
 
-def configure(config: InclinometerConfig, clock: Clock) -> None:
-    """Write the settings of the bench file to the device and check that it took them.
+def configure(config: InclinometerConfig, clock: Clock) -> dict[str, int]:
+    """Write the settings of the bench file to the device, let it keep them, and check that it took them.
+
+    Returns:
+        What each register held when it was read back at the end, by its name.
 
     Raises:
         Unavailable: the port cannot be opened, or the device does not answer or does not hold what was written.
+        Lost: the port went away.
     """
     old_baud = config.configure_baud or config.baud
-    _Setup(config.port, old_baud, clock).write_settings(wt931.settings(config.rate_hz, config.bandwidth_hz), config.baud)
-    if old_baud != config.baud:
-        _Setup(config.port, config.baud, clock).check({wt931.BAUD: wt931.BAUD_CODES[config.baud]})
+    settings = wt931.settings(config.rate_hz, config.bandwidth_hz)
+    with _talking(config.port, old_baud, clock) as setup:
+        setup.write_settings(settings, config.baud)
+    # Some devices change their baud rate with the write and some with the save: what came too late for the one is said again.
+    with _talking(config.port, config.baud, clock) as setup:
+        setup.save()
+        return setup.check(settings | {wt931.BAUD: wt931.BAUD_CODES[config.baud]})
+
+
+@contextmanager
+def _talking(url: str, baud: int, clock: Clock) -> Iterator[_Setup]:
+    setup = _Setup(url, baud, clock)
+    try:
+        yield setup
+    finally:
+        setup.source.close()
 
 
 class _Setup:
@@ -96,35 +115,31 @@ class _Setup:
         self.source, self.baud, self.clock = SerialSource(url, baud), baud, clock
 
     def write_settings(self, settings: dict[int, int], new_baud: int) -> None:
-        try:
-            for register, value in settings.items():
-                self._send(wt931.encode_unlock(), wt931.encode_command(register, value))
-            self._check(settings)
-            if new_baud != self.baud:
-                self._send(wt931.encode_unlock(), wt931.encode_command(wt931.BAUD, wt931.BAUD_CODES[new_baud]))
-            self._send(wt931.encode_unlock(), wt931.encode_command(wt931.SAVE, 0))
-        finally:
-            self.source.close()
+        for register, value in settings.items():
+            self._send(wt931.encode_unlock(), wt931.encode_command(register, value))
+        self.check(settings)
+        self._send(wt931.encode_unlock(), wt931.encode_command(wt931.BAUD, wt931.BAUD_CODES[new_baud]))
+        self.save()
 
-    def check(self, settings: dict[int, int]) -> None:
-        try:
-            self._check(settings)
-        finally:
-            self.source.close()
+    def save(self) -> None:
+        self._send(wt931.encode_unlock(), wt931.encode_command(wt931.SAVE, 0))
+
+    def check(self, settings: dict[int, int]) -> dict[str, int]:
+        return {_NAMES[register]: self._checked(register, value) for register, value in settings.items()}
 
     def _send(self, *commands: bytes) -> None:
         for command in commands:
             self.source.write(command)
             self.clock.sleep_until_ns(self.clock.now_ns() + _COMMAND_PAUSE_NS)
 
-    def _check(self, settings: dict[int, int]) -> None:
-        for register, value in settings.items():
-            held = self._read_back(register)
-            if held != value:
-                raise Unavailable(
-                    f"WT931 on {self.source.url}: its register {_NAMES[register]} holds {held} after {value} was written; "
-                    "re-power the device and try again"
-                )
+    def _checked(self, register: int, value: int) -> int:
+        held = self._read_back(register)
+        if held != value:
+            raise Unavailable(
+                f"WT931 on {self.source.url}: its register {_NAMES[register]} holds {held} after {value} was written; "
+                "re-power the device and try again"
+            )
+        return held
 
     def _read_back(self, register: int) -> int:
         for _ in range(_ATTEMPTS):

@@ -1,7 +1,7 @@
 """The process `valves`: the safety gate between the controller and the valve driver on CAN.
 
 It wakes on each command, or, when none comes, a little after it was due; each time it runs `gate_step` once and sends one
-valve frame. What happens without it: the driver's watchdog vents.
+valve frame, in the words of the driver that the bench file names. What happens without it: the driver vents by itself.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from softloop.devices.config import PERIOD_NS, ValvesProcess
 from softloop.devices.gate_messages import COMMAND as COMMAND_DTYPE
 from softloop.devices.gate_messages import FRAME, fill_status_of_arrays, give_command_of_arrays
 from softloop.devices.gate_messages import STATUS as STATUS_DTYPE
-from softloop.devices.protocols import can_frames
+from softloop.devices.protocols.quantise import counts_to_current
+from softloop.devices.valve_driver import ValveDriver, make_driver
 from softloop.wire.can_config import open_port
 from softloop.wire.can_port import CanPort
 from softloop.wire.channels import ARM, COMMAND, REQUEST, VALVES, key
@@ -39,12 +40,14 @@ def run(config: ValvesProcess, context: Context) -> None:
     """Run the gate until asked to stop, then vent.
 
     Raises:
-        Unavailable: the CAN bus cannot be opened.
+        Unavailable: the CAN bus cannot be opened, or the driver would not vent by itself.
         Lost: it went away.
     """
-    port = open_port(config.bus, config.valves.can, context.wire, context.clock, [can_frames.VALVE_STATUS_ID])
+    driver = make_driver(config)
+    port = open_port(config.bus, config.valves.can, context.wire, context.clock, driver.receive)
     try:
-        loop = ValvesLoop(config, context, port)
+        driver.prepare(port, context.clock)
+        loop = ValvesLoop(config, context, port, driver)
         context.enter_loop()
         while not context.stop:
             loop.wait()
@@ -59,16 +62,14 @@ def run(config: ValvesProcess, context: Context) -> None:
 class ValvesLoop:
     """The gate's wires, and what it keeps between two wakes."""
 
-    def __init__(self, config: ValvesProcess, context: Context, port: CanPort) -> None:
-        self.context, self.clock, self.port = context, context.clock, port
+    def __init__(self, config: ValvesProcess, context: Context, port: CanPort, driver: ValveDriver) -> None:
+        self.context, self.clock, self.port, self.driver = context, context.clock, port, driver
         self.wait_ns = PERIOD_NS + round(config.valves.command_wait_ms * 1e6)
         self.records = [np.zeros(1, d) for d in (g.GATE_CONFIG, g.GATE_STATE, g.GATE_INPUT, g.GATE_OUTPUT)]
         self.records[0][0] = g.gate_config(config)
         self.state, self.given, self.output = (record[0] for record in self.records[1:])  # views
         self.command, self.frame, self.word = np.zeros(1, COMMAND_DTYPE), np.zeros(1, FRAME), np.zeros(1, STATUS_DTYPE)
         self.command_bytes = self.command.view("u1")
-        self.driver = can_frames.E2eReceiver(can_frames.VALVE_STATUS_ID, config.valves.driver_max_lost)
-        self.driver_frame = can_frames.ValveStatusFrame(0, 0, 0, 0, 0)
         self.seq = self.tick = self.bus_offs = self.late_ns = 0
         self.said_driver, self.said_refusal, self.was_off = g.DRIVER_SILENT, 0, False
         self.lost: Lost | None = None
@@ -89,8 +90,6 @@ class ValvesLoop:
         g.gate_step_of_arrays(self.records[0], state, given, output)
         give_command_of_arrays(given, self.command, 0)
         fill_status_of_arrays(self.frame, given, state, output, self.word)
-        data = can_frames.encode_valve_command(can_frames.ValveCommandFrame(0, 0, 0, 0, 0))
-        can_frames.decode_valve_status(data)
 
     def wait(self) -> None:
         """Return at the next command, or at the deadline; notes which."""
@@ -155,12 +154,12 @@ class ValvesLoop:
             frame = self.driver_frames.recv(0.0)
             if frame is None:
                 return
-            data = frame.data[: frame.dlc]
-            if frame.flags == 0 and frame.arbitration_id == can_frames.VALVE_STATUS_ID and self.driver.judge(data).usable:
-                self.driver_frame = can_frames.decode_valve_status(data)
-                watchdog = self.driver_frame.state != can_frames.STATE_OK
-                self.given.driver = g.DRIVER_WATCHDOG if watchdog else g.DRIVER_OK
+            word = self.driver.hear(frame) if frame.flags == 0 else None
+            if word is not None:
+                self.given.driver = word
                 self.given.driver_stamp_ns = min(frame.stamp_ns, self.clock.now_ns())
+            if word == g.DRIVER_WATCHDOG:
+                return  # to be judged before what comes after it
 
     def step(self) -> None:
         """The gate's judgement, now."""
@@ -172,11 +171,12 @@ class ValvesLoop:
         output = self.output
         self.seq += 1
         counts = int(output.charge_counts), int(output.exhaust_counts)
-        frame = can_frames.ValveCommandFrame(self.seq % can_frames.COUNTER_STATES, int(output.output), *counts, self.seq & 0xFFFF)
+        frames = self.driver.frames(int(output.output), *counts, self.seq)
+        output.charge_current_ma, output.exhaust_current_ma = (counts_to_current(self.driver.realised(c)) for c in counts)
         stamp_ns = self.clock.now_ns()
         if self.lost is None:
             try:
-                self._send(can_frames.encode_valve_command(frame), stamp_ns)
+                self._send(frames, stamp_ns)
             except Lost as error:
                 self.lost = error
         self._publish(stamp_ns)
@@ -185,15 +185,16 @@ class ValvesLoop:
         if self.lost is not None:
             raise self.lost
 
-    def _send(self, data: bytes, stamp_ns: int) -> None:
-        if self.sender.send(can_frames.VALVE_COMMAND_ID, data, stamp_ns):
-            self.context.pace.note_sent(stamp_ns)
-        else:
-            self.status.dropped += 1
+    def _send(self, frames: list[tuple[int, bytes]], stamp_ns: int) -> None:
+        for place, (arbitration_id, data) in enumerate(frames):
+            if not self.sender.send(arbitration_id, data, stamp_ns):
+                self.status.dropped += 1
+            elif place == 0:
+                self.context.pace.note_sent(stamp_ns)
 
     def _publish(self, stamp_ns: int) -> None:
-        driver = self.driver_frame
-        self.frame[0] = (self.seq, stamp_ns, self.tick, driver.charge_counts, driver.exhaust_counts, self.driver.rejected)
+        driver = self.driver
+        self.frame[0] = (self.seq, stamp_ns, self.tick, *driver.coils, driver.rejected)
         fill_status_of_arrays(self.frame, self.records[2], self.records[1], self.records[3], self.word)
         self.put(_STATUS.pack_record(self.word[0]))
 

@@ -102,7 +102,9 @@ def _row(log: Log, charging: bool, start_ns: int, end_ns: int, volume: Volume) -
     up, down = (supply, chamber) if charging else (chamber, 0.0)
     if up - down < LEAST_KPA:
         return None
-    current = float(words["charge_coil_ma" if charging else "exhaust_coil_ma"].mean())
+    valve = "charge" if charging else "exhaust"
+    measured, sent = words[f"{valve}_coil_ma"], words[f"{valve}_current_ma"]
+    current = float(np.where(np.isfinite(measured), measured, sent).mean())  # not every driver measures
     return current, up, down, volume.flow_kg_s(slope if charging else -slope)
 
 

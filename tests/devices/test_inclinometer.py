@@ -164,7 +164,7 @@ def test_configuring_writes_reads_back_and_saves(setting):
     with setting.running():
         until(setting.samples.look)
     device.end()
-    assert device.saved == {wt931.RSW: 12, wt931.RRATE: 0x0B, wt931.BANDWIDTH: 2, wt931.AXIS6: 1}
+    assert device.saved == {wt931.RSW: 12, wt931.RRATE: 0x0B, wt931.BANDWIDTH: 2, wt931.AXIS6: 1, wt931.BAUD: 6}
 
 
 def test_a_new_baud_rate_is_written_last_and_read_back(setting):

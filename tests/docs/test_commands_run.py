@@ -28,7 +28,7 @@ FIRST = ["run", "sim", "--page", "--run-dir", "runs/first"]
 SECOND = ["run", "pid.toml", "--run-dir", "runs/second"]
 BESIDE = ("top", "echo", "page", "foxglove", "request")
 ON_LOGS = ("plot", "report", "compare", "replay", "keys")
-ELSEWHERE = ("doctor", "install", "log", "parity")  # in tests of their own
+ELSEWHERE = ("doctor", "install", "log", "parity", "wt931", "canopen", "calibrate")  # in tests of their own
 STANDS_FOR = {"runs/<run>": "runs/first", "runs/RUN": "runs/first", "runs/RUN_A": "runs/first", "runs/RUN_B": "runs/second"}
 # What is long in the documentation is short here: these words are added, or stand in for others.
 LESS = {
@@ -67,7 +67,13 @@ class Place:
         self.environment = {**os.environ, "XDG_RUNTIME_DIR": str(folder)}
         times = np.arange(0.0, 600.0, 0.05)
         np.savetxt(folder / "wave.csv", np.c_[times, 60 + 10 * np.sin(times / 3)], delimiter=",", header="t_s,angle_deg")
-        for name, shipped in (("sim", "sim"), ("sim.toml", "sim"), ("sim_t2", "sim_t2"), ("my_bench.toml", "sim")):
+        for name, shipped in (
+            ("sim", "sim"),
+            ("sim.toml", "sim"),
+            ("sim_t2", "sim_t2"),
+            ("my_bench.toml", "sim"),
+            ("my_rig.toml", "sim"),
+        ):
             (folder / name).write_text(
                 f'base = "{shipped_benches()[shipped]}"\n{WIDE}[page]\nport = 0\n[foxglove]\nport = 0\n'
                 f'[controller]\ntrajectory = "{folder}/wave.csv"\napproach_s = 2.0\n'

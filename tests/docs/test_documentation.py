@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import typer
 
+from softloop.deploy.bench import load_bench
 from softloop.deploy.cli import app
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "offline"))
@@ -84,6 +85,20 @@ def test_the_tutorials_bench_is_right(tmp_path):
     command = [sys.executable, "-m", "softloop.deploy.cli", "check", "pid.toml"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_benches_of_a_real_rig_are_right(tmp_path):
+    """Its first one as it stands; what is shown after it, each laid over that one."""
+    first, *more = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs" / "real-rig.md").read_text(), re.S | re.M)
+    for name in ("sim", "real"):
+        shutil.copy(ROOT / "deploy" / "benches" / f"{name}.toml", tmp_path)
+    (tmp_path / "my_rig.toml").write_text(first)
+    bench = load_bench(tmp_path / "my_rig.toml")
+    assert (bench.valves.pressure_max_kpa, bench.plant) == (60.0, None)
+    assert len(more) == 2
+    for text in more:
+        (tmp_path / "more.toml").write_text(f'base = "my_rig.toml"\n{text}')
+        assert load_bench(tmp_path / "more.toml").name == "my_rig"
 
 
 def test_the_pages_build_without_a_warning(tmp_path):
