@@ -138,8 +138,7 @@ def _identified(work: Work, name: str, output: str, what: str, only: str = "") -
     series = data_of(fast, slow)
     found = identify_all(series, work.counting(what), only)
     fit = found.model("oe").fit
-    # For the laws the bounds are the paper's: three standard errors of white residuals.
-    write_evidence(work.folder / output, [fast, slow], fit, of_fit(fit, [series[0]], "white"), list(series))
+    write_evidence(work.folder / output, [fast, slow], fit, of_fit(fit, [series[0]], "coloured"), list(series))
     return found
 
 

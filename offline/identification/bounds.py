@@ -1,8 +1,8 @@
 """Bounds of the parameters for the laws: the box that covers what the covariance allows, as far as a law can feel it.
 
-A law is robust against phi_b^T (theta - theta_hat), and sizes its robust terms by a box: theta_M^T |phi_b| (Eqs. 38 and 47). Where
-parameters can hardly be told apart (c2 and c3), each alone is uncertain by as much as itself, while the sum that enters Eq. 2 is
-well known. The box of three standard errors of each forgets that, and its theta_M^T |phi_b| is then many times what the
+A law is robust against phi_b^T (theta - theta_hat), and sizes its robust terms by a box: theta_M^T |phi_b| (Eqs. 38, 47). Where
+parameters can hardly be told apart (c2 and c3), each alone is uncertain by as much as itself, while the sum that enters Eq. 2
+is well known. The box of three standard errors of each forgets that, and its theta_M^T |phi_b| is then many times what the
 data leave open. Here the box is the smallest whose half widths w still hold, for every state of the excitation,
 
     w^T |phi_b|  >=  3 sqrt(phi_b^T Cov phi_b),
@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 
 BOUND_ERRORS = 3.0  # "three standard deviations of the means", as the paper has it
 ANGLES, RATES, PRESSURES = 12, 7, 4  # of the grid of states
-_REST = 1e-9  # the solver's tolerance, relative
+_REST = 1e-9  # relative; the box of the paper meets the condition only just where one parameter stands alone
 
 
 def regressors(angle_deg: Floats, rate_deg_s: Floats, pressure_kpa: Floats) -> Floats:
@@ -54,11 +54,13 @@ def half_widths(covariance: Floats, phi: Floats) -> Floats:
     marginal = BOUND_ERRORS * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if not (marginal > 0.0).all():
         raise BadConfig("the covariance has a variance that is not above 0; no bounds follow from it")
-    alone = BOUND_ERRORS / np.sqrt(np.diag(np.linalg.pinv(covariance / np.outer(marginal, marginal), hermitian=True)))
+    information = np.linalg.pinv(covariance / np.outer(marginal, marginal), hermitian=True)
+    alone = np.minimum(BOUND_ERRORS / np.sqrt(np.diag(information)), 1.0)
     size = np.abs(phi) * marginal  # unknowns are the half widths in parts of the marginal ones
     least = BOUND_ERRORS * np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", phi, covariance, phi), 0.0))
     shape = size / least[:, None]
-    found = linprog(shape.sum(axis=0), -shape, -np.full(len(phi), 1.0 - _REST), bounds=np.stack([alone, np.ones(len(alone))], axis=1))
+    limits = np.stack([alone, np.ones(len(alone))], axis=1)
+    found = linprog(shape.sum(axis=0), -shape, np.full(len(phi), _REST - 1.0), bounds=limits)
     if found.status != 0:
         raise BadConfig(f"no bounds follow from the covariance: {found.message}")
     return np.asarray(found.x * marginal, np.float64)
