@@ -46,7 +46,7 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/softloop warm
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not rig and not exact and not page and not commands and not long'
-	$(BIN)/python -m pytest -m 'rig and not page'
+	$(BIN)/python -m pytest -m 'rig and not page and not long'
 
 # The live page in Debian's chromium, a whole rig behind it in the last tests; other browsers by CHROMIUM=PATH.
 test-page: $(STAMP)
