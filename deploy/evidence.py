@@ -14,6 +14,7 @@ import tomlkit
 from pydantic import ValidationError
 
 from softloop.dynamics.parameters import Parameters, shipped
+from softloop.offline.identification.bounds import bounds_of
 from softloop.offline.identification.intervals import Uncertainty
 from softloop.offline.identification.output_error import Fit, score
 from softloop.offline.identification.series import Series
@@ -23,8 +24,6 @@ from softloop.offline.run_log import find_log, open_run
 from softloop.wire.benchfile import validated
 from softloop.wire.errors import BadConfig, BadFile
 from softloop.wire.log_parts import parts_of
-
-BOUND_ERRORS = 3.0  # "three standard deviations of the means", as the paper has it
 
 
 def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty, series: Sequence[Series]) -> None:
@@ -44,7 +43,7 @@ def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty
         raise BadConfig("--output needs logs, orders 2,0,3 and one pressure: that is the model which the controller has")
     log = open_run(runs[0])
     content = _base(log)
-    content |= {"name": file.stem, "bending": _bending(sure)}
+    content |= {"name": file.stem, "bending": _bending(sure, series[0])}
     content["evidence"] = _evidence([runs[0], *runs], log, fit, sure, series)
     try:
         validated(Parameters, content)
@@ -72,10 +71,11 @@ def _base(log: Log) -> dict[str, Any]:
         raise BadFile(f"{log.path}: its parameter file cannot be read: {error}") from None
 
 
-def _bending(sure: Uncertainty) -> dict[str, dict[str, float]]:
-    half = BOUND_ERRORS * sure.errors
-    rows = zip(sure.names, sure.values.tolist(), half.tolist(), strict=True)
-    return {n: {"value": v, "min": v - h, "max": v + h} for n, v, h in rows if n in PAPER.names}
+def _bending(sure: Uncertainty, train: Series) -> dict[str, dict[str, float]]:
+    kept = [sure.names.index(name) for name in PAPER.names]
+    half = bounds_of(sure.covariance[np.ix_(kept, kept)], train)
+    rows = zip(PAPER.names, sure.values[kept].tolist(), half.tolist(), strict=True)
+    return {n: {"value": v, "min": v - h, "max": v + h} for n, v, h in rows}
 
 
 def _evidence(runs: Sequence[Path], log: Log, fit: Fit, sure: Uncertainty, series: Sequence[Series]) -> dict[str, Any]:

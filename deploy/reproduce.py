@@ -7,6 +7,7 @@ without logs; its rows say which seeds. Coverage, the longest, is a process of i
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -138,8 +139,7 @@ def _identified(work: Work, name: str, output: str, what: str, only: str = "") -
     series = data_of(fast, slow)
     found = identify_all(series, work.counting(what), only)
     fit = found.model("oe").fit
-    # For the laws the bounds are the paper's: three standard errors of white residuals.
-    write_evidence(work.folder / output, [fast, slow], fit, of_fit(fit, [series[0]], "white"), list(series))
+    write_evidence(work.folder / output, [fast, slow], fit, of_fit(fit, [series[0]], "coloured"), list(series))
     return found
 
 
@@ -215,9 +215,10 @@ def _coverage(folder: Path, rigs: int) -> Iterator[subprocess.Popen[bytes] | Non
         return
     words = ["coverage", "--rigs", str(rigs), "--layer", "ideal", "--output", str(folder / COVERAGE), "--json"]
     with (folder / "coverage.log").open("wb") as log:
-        child = subprocess.Popen(
-            [sys.executable, "-m", "softloop.deploy.cli", *words], stdout=log, stderr=log, stdin=subprocess.DEVNULL
-        )
+        # Small matrices only: a second thread of the linear algebra would wait, and burn the core that the rest works on.
+        alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+        command = [sys.executable, "-m", "softloop.deploy.cli", *words]
+        child = subprocess.Popen(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, env=alone)
         try:
             yield child
         finally:

@@ -73,7 +73,7 @@ class EvidenceRun(Table):
 
 
 class Evidence(Table):
-    """Where the bending values come from. Their bounds are three standard errors, as in the paper."""
+    """Where the bending values come from. Their bounds hold three standard errors of what they do together."""
 
     rig: str = Field(description="identity of the rig, as its bench says it: run.rig, or the bench's name")
     method: str = Field(description="estimator, and what its residuals were taken for")

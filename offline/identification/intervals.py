@@ -2,8 +2,10 @@
 
 - `white`: the textbook's covariance, which is what the paper's printed intervals have the size of. Only right when residuals
   are white.
-- `coloured`: the residuals are an autoregressive process that the input knows nothing of (noise of the sensors, also noise of
-  the pressure's sensor that has gone through the actuator).
+- `coloured`: the residuals are a stationary process that the input knows nothing of (noise of the sensors, also noise of the
+  pressure's sensor that has gone through the actuator). Of a regression's residuals, whose colour is its filter's, an
+  autoregressive model; of output error's, the smoothed spectrum: their white noise of the angle hides the slow noise that went
+  through the actuator from an autoregressive model of few terms, and it is the slow part that moves the parameters.
 - `bootstrap`: blocks of the experiment are drawn anew; takes what the model leaves out, as far as it forgets within a block.
 - `between`: several experiments, each fitted on its own; takes everything that differs between them.
 """
@@ -28,6 +30,7 @@ LEVEL = 0.95
 ORDER_MOST = 40  # of the autoregressive model
 BLOCK_S = 10.0
 DRAWS = 400
+SMOOTH_BINS = 20  # of the spectrum, to either side: far more than the unknowns, which take their own share of the residuals away
 MOVED = 1e-2  # a direction without information moves an unknown when it has this part of it
 
 
@@ -82,7 +85,8 @@ def of_fit(fit: Fit, experiments: list[Series], method: str, seed: int = 1) -> U
         covariance, degrees = bootstrap(residuals, jacobians, [e.time_s[e.counted] for e in experiments], seed)
     else:
         gain = _damped_inverse(np.sum([j.T @ j for j in jacobians], axis=0))
-        meat = np.sum([_meat(r, j, method) for r, j in zip(residuals, jacobians, strict=True)], axis=0)
+        meat_of = _white_meat if method == "white" else _spectral_meat
+        meat = np.sum([meat_of(r, j) for r, j in zip(residuals, jacobians, strict=True)], axis=0)
         covariance = gain @ meat @ gain
     covariance = (covariance * np.outer(scale, scale))[:kept, :kept]
     named = fit.named()
@@ -101,11 +105,31 @@ def of_regression(found: Regression, method: str) -> Uncertainty:
 def _meat(error: Floats, columns: Floats, method: str) -> Floats:
     """Covariance of columns^T error: the error white, or autoregressive."""
     if method == "white":
-        return columns.T @ columns * float(error @ error) / max(len(error) - columns.shape[1], 1)
+        return _white_meat(error, columns)
     coefficients, variance = autoregressive(error)
     # error = w / A(q) with white w, so columns^T error = (columns filtered by 1 / A backwards in time)^T w.
     shaped = lfilter([1.0], coefficients, columns[::-1], axis=0)
     return shaped.T @ shaped * variance
+
+
+def _white_meat(error: Floats, columns: Floats) -> Floats:
+    return columns.T @ columns * float(error @ error) / max(len(error) - columns.shape[1], 1)
+
+
+def _spectral_meat(error: Floats, columns: Floats) -> Floats:
+    """Covariance of columns^T error by Parseval: the columns' spectra weighed with the error's smoothed power."""
+    n = len(error)
+    power = np.abs(np.fft.rfft(error)) ** 2 / max(n - columns.shape[1], 1)
+    wide = min(SMOOTH_BINS, len(power) - 1)
+    window = np.bartlett(2 * wide + 3)[1:-1]
+    mirrored = np.pad(power, wide, "reflect") if wide else power
+    smooth = np.convolve(mirrored, window / window.sum(), "valid")
+    spectra = np.fft.rfft(columns, axis=0)
+    both_sides = np.full(len(power), 2.0)
+    both_sides[0] = 1.0
+    if n % 2 == 0:
+        both_sides[-1] = 1.0
+    return np.asarray(((spectra.conj().T * (both_sides * smooth)) @ spectra).real / n, np.float64)
 
 
 def autoregressive_covariance(error: Floats, jacobian: Floats) -> Floats:

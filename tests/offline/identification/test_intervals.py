@@ -5,7 +5,14 @@ from scipy.signal import lfilter
 
 from softloop.offline.identification.coverage import true_values
 from softloop.offline.identification.fitting import fit_output_error
-from softloop.offline.identification.intervals import _meat, autoregressive, between, information_rank, of_fit
+from softloop.offline.identification.intervals import (
+    _meat,
+    _spectral_meat,
+    autoregressive,
+    between,
+    information_rank,
+    of_fit,
+)
 from softloop.offline.identification.output_error import Fit
 from softloop.offline.identification.structure import PAPER
 
@@ -32,6 +39,32 @@ def test_coloured_covariance_is_what_repetition_shows_and_white_is_not():
     scatter = np.var(draws, axis=0)
     assert np.mean(claimed, axis=0) == pytest.approx(scatter, rel=0.35)
     assert (np.mean(naive, axis=0) < 0.2 * scatter).all()
+
+
+def test_slow_noise_under_white_noise_is_seen_by_the_spectrum():
+    t = np.arange(8000) * 0.01
+    columns = np.stack([np.sin(0.5 * t), np.cos(1.3 * t), np.ones_like(t)], axis=1)
+    gain = np.linalg.inv(columns.T @ columns)
+    draws, claimed, few_terms = [], [], []
+    for seed in range(200):
+        random = np.random.RandomState(seed)
+        error = lfilter([0.02], [1.0, -0.98], random.standard_normal(len(t))) + 0.5 * random.standard_normal(len(t))
+        draws.append(gain @ columns.T @ error)
+        left = error - columns @ draws[-1]  # what a fit leaves
+        claimed.append(np.diag(gain @ _spectral_meat(left, columns) @ gain))
+        few_terms.append(np.diag(gain @ _meat(left, columns, "coloured") @ gain))
+    scatter = np.var(draws, axis=0)
+    assert np.mean(claimed, axis=0) == pytest.approx(scatter, rel=0.25)
+    assert (np.mean(few_terms, axis=0) < 0.8 * scatter).all()
+
+
+def test_spectrum_of_white_noise_gives_the_textbooks_covariance_of_any_length():
+    for n in (7, 60, 4001):
+        columns = np.random.RandomState(3).standard_normal((n, 2))
+        found = _spectral_meat(np.random.RandomState(4).standard_normal(n), columns)
+        assert np.linalg.eigvalsh(found).min() > 0.0
+        if n > 1000:
+            assert found == pytest.approx(_meat(np.random.RandomState(4).standard_normal(n), columns, "white"), rel=0.1, abs=60.0)
 
 
 def test_intervals_of_an_output_error_fit_hold_true_values():
