@@ -14,7 +14,7 @@ PORT, SERIAL_PORT = 7447, 7448  # in namespaces of our own: nobody else has them
 SHIFT_MS = 1.0  # what a busy machine adds to a way
 
 
-def bench_text(network, way: Way, *, mode="peer", shared_router=False, more=""):
+def bench_text(network, way: Way, *, mode="peer", shared_router=False, duration_s=0.0):
     """The shipped T2 bench on three hosts, over TLS, that declares what the network costs.
 
     A packet that is lost comes a round trip and a tick later, if that is not lost too: budgets of a bench on a cable that loses
@@ -26,7 +26,7 @@ def bench_text(network, way: Way, *, mode="peer", shared_router=False, more=""):
     tables = {
         "zenoh": {"mode": mode, "endpoint": f"tls/{network.address_of(LEADER)}:{PORT}"},
         "zenoh.tls": {"folder": "{bench_dir}/keys"},
-        "run": {"shared_router": shared_router},
+        "run": {"shared_router": shared_router, "duration_s": duration_s, "report": False},
         "clock": {"uncertainty_max_ms": 2.0 + one_way_ms + SHIFT_MS},
         **{f"hosts.{name}": {"address": network.address_of(name)} for name in network.hosts},
         **{process: {"host": host} for process, host in SHARES.items()},
@@ -40,7 +40,7 @@ def bench_text(network, way: Way, *, mode="peer", shared_router=False, more=""):
         "inclination_budget_ms": 30.0 + one_way_ms + wait_ms,
     }
     head = f'base = "{shipped_benches()["sim_t2"]}"\nname = "net"\n'
-    return head + "".join(f"[{name}]\n{lines(keys)}" for name, keys in tables.items()) + more
+    return head + "".join(f"[{name}]\n{lines(keys)}" for name, keys in tables.items())
 
 
 def lines(keys):
