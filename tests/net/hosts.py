@@ -26,7 +26,7 @@ def bench_text(network, way: Way, *, mode="peer", shared_router=False, duration_
     tables = {
         "zenoh": {"mode": mode, "endpoint": f"tls/{network.address_of(LEADER)}:{PORT}"},
         "zenoh.tls": {"folder": "{bench_dir}/keys"},
-        "run": {"shared_router": shared_router, "duration_s": duration_s, "report": False},
+        "run": {"shared_router": shared_router, "duration_s": duration_s, "report": False, "ready_timeout_s": 120.0},
         "clock": {"uncertainty_max_ms": 2.0 + one_way_ms + SHIFT_MS},
         **{f"hosts.{name}": {"address": network.address_of(name)} for name in network.hosts},
         **{process: {"host": host} for process, host in SHARES.items()},

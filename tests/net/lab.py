@@ -4,10 +4,10 @@
     board  10.77.2.2 --veth-- | network | --TUN-- relay
     logger 10.77.3.2 --veth-- +---------+
 
-The network is a namespace too. It routes what comes from a host into the TUN device, and what the relay puts back to the host that
-it is for; where the kernel has netem, that can stand in for the relay, on the network's end of each link. No namespace has a name,
-and nothing is made in that of the computer itself: all of it is held by processes that end with this one, however it ends, and goes
-with them.
+The network is a namespace too. It routes what comes from a host into the TUN device, and what the relay puts back to the host
+that it is for; where the kernel has netem, that can stand in for the relay, on the network's end of each link. No namespace has a
+name, and nothing is made in that of the computer itself: all of it is held by processes that end with this one, however it ends,
+and goes with them.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ class Network:
 
     @contextlib.contextmanager
     def netem(self, way: Way) -> Iterator[None]:
-        """The same by the kernel's own discipline, on the network's end of every link. Raises NetlinkError where there is none."""
+        """The same by the kernel's own discipline, on the network's end of every link. Raises NetlinkError without it."""
         route, ends = self.middle.route, [self.middle.index(f"to-{name}") for name in self.hosts]
         made: list[int] = []
         try:

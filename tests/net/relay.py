@@ -74,7 +74,9 @@ class Relay:
         late = sorted(self.late_ns)
         parts = {"p50": 0.5, "p99": 0.99, "p99_9": 0.999, "max": 1.0}
         return {
-            "late_us": {name: late[min(len(late) - 1, int(part * len(late)))] / 1e3 for name, part in parts.items()} if late else {},
+            "late_us": {name: late[min(len(late) - 1, int(part * len(late)))] / 1e3 for name, part in parts.items()}
+            if late
+            else {},
             "directions": {
                 name: {"put_in": c.put_in, "lost": c.lost, "overrun": c.overrun, "passed": c.passed}
                 for name, c in self.cables.items()

@@ -1,0 +1,106 @@
+"""A cut cable, and a router that is killed: the gate vents, no process is restarted, and one word of a person goes on."""
+
+import signal
+import subprocess
+import time
+
+from softloop.offline.run_log import open_run
+from softloop.wire.messages import constant
+from tests.net.cable import Way
+from tests.net.figures import COIL_OFF_MA, first_after, gate_events
+from tests.net.hosts import LEADER, LOGGER, bench_text, rig_on
+from tests.rig.fleets import CLI
+
+ARMED, FAULT = constant("ValveStatus", "GATE_ARMED"), constant("ValveStatus", "GATE_FAULT")
+AWAY_S = 2.0
+DURATION_S = 40.0  # armed, with what is cut out of it
+VENT_MS = (
+    60.0  # from the last tick that is in the log to no current: the silence budget of 20 ms, a tick, the coil; and a busy machine
+)
+BACK_S = 2.0
+WAITS = "it waits to be armed again"
+
+
+def cut_cable(network):
+    """The controller's cable is out for `AWAY_S`; the devices and the recorder hear each other meanwhile, so all of it is logged."""
+    way = Way()
+    with rig_on(network, bench_text(network, way, duration_s=DURATION_S)) as rigs:
+        rigs.wait_for_word(LEADER, "phase track")
+        before = pids(rigs)
+        time.sleep(1.0)
+        network.cable(LEADER, plugged=False)
+        time.sleep(AWAY_S)
+        network.cable(LEADER, plugged=True)
+        back_ns = time.monotonic_ns()
+        rigs.wait_for_word(LEADER, WAITS)
+        said_s = (time.monotonic_ns() - back_ns) * 1e-9
+        return concluded(network, rigs, "cut cable", before, {"waits_s": said_s}, back_ns)
+
+
+def killed_router(network):
+    """A router of its own, through which all goes, is killed with SIGKILL and started again."""
+    text = bench_text(network, Way(), mode="client", shared_router=True, duration_s=DURATION_S)
+    with rig_on(network, text, router_on=LEADER) as rigs:
+        rigs.wait_for_word(LEADER, "phase track")
+        before = pids(rigs)
+        time.sleep(1.0)
+        rigs.routers[-1].send_signal(signal.SIGKILL)
+        rigs.routers[-1].wait()
+        rigs.wait_for_word(LEADER, "the meeting point is lost")
+        time.sleep(AWAY_S)
+        rigs.start_router(network.hosts[LEADER].inside([]))
+        back_ns = time.monotonic_ns()
+        rigs.wait_for_word(LEADER, WAITS)
+        return concluded(network, rigs, "killed router", before, {}, back_ns)
+
+
+def concluded(network, rigs, name, before, found, back_ns):
+    """Arm again, let the run end by itself, and read what its log says."""
+    restarted = sorted(what for what, pid in pids(rigs).items() if before.get(what) != pid)
+    armed = subprocess.run(network.hosts[LEADER].inside([*CLI, "request", str(rigs.bench), "arm"]), env=rigs.environment,
+                           capture_output=True, text=True, timeout=60, check=False)  # fmt: skip
+    codes = rigs.finish()
+    log = open_run(rigs.hosts[LOGGER].run_dir)
+    found |= {"incident": name, "codes": codes, "restarted": restarted, "left_over": rigs.left_over()}
+    found |= {
+        "armed_again": armed.returncode == 0,
+        "vented_ms": vented_ms(log),
+        "back_s": max(first_after(log, back_ns).values()),
+    }
+    found["gate"] = [state for _, state in gate_events(log)]
+    return found | {"failed": failures(found)}
+
+
+def vented_ms(log):
+    """From the last tick before the gate's FAULT that is in the log until the charge coil was without current, by the truth."""
+    faults = [at for at, state in gate_events(log) if state == FAULT]
+    truth, ticks = log["truth"], log["cycle"]["stamp_ns"]
+    if faults:
+        at_ns = faults[0]
+    else:  # its word went astray with all others: from the first status that says so
+        status = log["valves"][log["valves"]["gate"] == FAULT]
+        if not len(status):
+            return float("inf")
+        at_ns = int(status["stamp_ns"][0])
+    last_ns = ticks[ticks <= at_ns][-1]
+    off = truth[(truth["stamp_ns"] > last_ns) & (truth["charge_coil_ma"] < COIL_OFF_MA)]
+    return float(off["stamp_ns"][0] - last_ns) * 1e-6 if len(off) else float("inf")
+
+
+def failures(found):
+    """The bounds that an incident does not keep, one line each."""
+    limit_ms = VENT_MS if found["incident"] == "cut cable" else float("inf")  # without a router nothing is logged
+    checks = (
+        (found["vented_ms"] > limit_ms, f"vented {found['vented_ms']:.0f} ms after the last tick"),
+        (found["restarted"], f"restarted: {found['restarted']}"),
+        (not found["armed_again"], "not armed again"),
+        (found["gate"].count(ARMED) < 1, "never armed in the log"),
+        (found["back_s"] > BACK_S, f"all back after {found['back_s']:.2f} s"),
+        (any(found["codes"].values()), f"exit codes {found['codes']}"),
+        (found["left_over"], f"left over: {found['left_over']}"),
+    )
+    return [text for bad, text in checks if bad]
+
+
+def pids(rigs):
+    return {key: process.pid for key, process in rigs.family().items()}
