@@ -89,15 +89,15 @@ def clocks(words):
 def failures(cell: Cell):
     """The bounds that a cell does not keep, one line each.
 
-    Without loss the rig stays armed and tracks as well as the paper's. Where packets are lost it may vent instead, if it did so at
-    once: a packet lost twice is later than any budget.
+    Without loss the rig stays armed and tracks as well as the paper's. Where packets are lost it may vent instead, if it did so
+    at once: a packet lost twice is later than any budget.
     """
     if not cell.figures:
         return [f"no log; the hosts ended with {cell.codes}"]
     f, delay_ms = cell.figures, cell.network["delay_ms"] + cell.network["jitter_ms"]
     checks = [
         (f["silent_channels"], f"the recorder lost a channel: {f['silent_channels']}"),
-        (not len(cell.clocks) == len(AHEAD_S) - 1, f"clocks are known of {sorted(cell.clocks)} alone"),
+        (len(cell.clocks) != len(AHEAD_S) - 1, f"clocks are known of {sorted(cell.clocks)} alone"),
         *((c["inside"] < INSIDE, f"{n}: true offset inside in {c['inside']:.1%}") for n, c in cell.clocks.items()),
         ((f["tick_late_p99_us"] or 0.0) > LATE_P99_US, f"99 % of ticks late by up to {f['tick_late_p99_us']} us"),
         (f["ticks_skipped"] > SKIPPED * f["ticks"], f"{f['ticks_skipped']} of {f['ticks']} ticks skipped"),

@@ -10,30 +10,30 @@ from tests.security.secured import make
 LEADER, BOARD, LOGGER = "desk", "board", "logger"
 AHEAD_S = {LEADER: 0, BOARD: 1000, LOGGER: -400}  # of the machine's monotonic clock
 SHARES = {"plant": BOARD, "valves": BOARD, "pressures": BOARD, "inclinometer": BOARD, "controller": LEADER, "recorder": LOGGER}
+HOLD_TICKS = 12
 PORT, SERIAL_PORT = 7447, 7448  # in namespaces of our own: nobody else has them
-SHIFT_MS = 1.0  # what a busy machine adds to a way
 
 
 def bench_text(network, way: Way, *, mode="peer", shared_router=False, duration_s=0.0):
     """The shipped T2 bench on three hosts, over TLS, that declares what the network costs.
 
-    A packet that is lost comes a round trip and a tick later, if that is not lost too: budgets of a bench on a cable that loses
-    any are as wide as the gate allows, 21 ticks without a command and 20 of slack for samples.
+    Budgets are wide, as in all tests of whole rigs: a stall of a busy machine is not the network's. On a cable that loses packets
+    they are as wide as the gate allows: one that is lost comes a round trip and a tick later, if it is not lost again.
     """
     one_way_ms = way.delay_ms + way.jitter_ms
-    ticks = {"hold_ticks": 20, "age_ticks": 20} if way.loss else {}
-    wait_ms = 100.0 if way.loss else 0.0
+    ticks = {"hold_ticks": 20, "age_ticks": 20} if way.loss else {"hold_ticks": HOLD_TICKS, "age_ticks": 16}
+    wait_ms = 100.0 if way.loss else 80.0
     tables = {
         "zenoh": {"mode": mode, "endpoint": f"tls/{network.address_of(LEADER)}:{PORT}"},
         "zenoh.tls": {"folder": "{bench_dir}/keys"},
         "run": {"shared_router": shared_router, "duration_s": duration_s, "report": False, "ready_timeout_s": 120.0},
-        "clock": {"uncertainty_max_ms": 2.0 + one_way_ms + SHIFT_MS},
+        "clock": {"uncertainty_max_ms": 3.0 + 2.0 * one_way_ms},
         **{f"hosts.{name}": {"address": network.address_of(name)} for name in network.hosts},
         **{process: {"host": host} for process, host in SHARES.items()},
     }
-    tables["plant"] |= {"serial": f"listen://127.0.0.1:{SERIAL_PORT}"}
+    tables["plant"] |= {"serial": f"listen://127.0.0.1:{SERIAL_PORT}", "watchdog_ms": 100.0}
     tables["inclinometer"] |= {"port": f"socket://127.0.0.1:{SERIAL_PORT}"}
-    tables["valves"] |= {"path_delay_ms": 2.0 + 2.0 * one_way_ms, **ticks}
+    tables["valves"] |= {"path_delay_ms": 2.0 + 2.0 * one_way_ms, "driver_silence_ms": 100.0, **ticks}
     tables["controller"] |= {
         "actuation_delay_ms": 3.0 + way.delay_ms + way.jitter_ms / 2,
         "pressure_budget_ms": 20.0 + one_way_ms + wait_ms,

@@ -24,7 +24,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
-from pyroute2 import IPRoute, NetlinkError, NetNS
+from pyroute2 import IPRoute, NetlinkError, netns
 
 from tests.net.cable import Way
 
@@ -57,7 +57,7 @@ class Namespace:
         stay = ["unshare", "--net", *clock, "--fork", "--kill-child", "sh", "-c", "echo $$; exec cat"]
         self._holder = subprocess.Popen(stay, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
         self.pid = int(_line(self._holder.stdout))
-        self.route = NetNS(f"/proc/{self.pid}/ns/net", flags=0)
+        self.route = _route_in(f"/proc/{self.pid}/ns/net")
         self.route.link("set", index=self.index("lo"), state="up")
 
     def index(self, device: str) -> int:
@@ -76,6 +76,21 @@ class Namespace:
         with contextlib.suppress(Exception):
             self.route.close()
         self._holder.communicate()
+
+
+def _route_in(namespace: str) -> IPRoute:
+    """Netlink in another network namespace. Its socket stays there; this thread is back at once.
+
+    `pyroute2.NetNS` forks to the same end, and hangs at times where others' threads run, as Zenoh's do.
+    """
+    with open("/proc/thread-self/ns/net") as here:
+        netns.setns(namespace, flags=0, fork=False)
+        try:
+            route = IPRoute()
+            route.link_lookup(ifname="lo")
+            return route
+        finally:
+            netns.setns(here, flags=0, fork=False)
 
 
 def _line(stream: IO[str] | None) -> str:
