@@ -1,6 +1,6 @@
 """The rig on three computers with a network between them: how it tracks and how late its ticks are, and what it survives.
 
-    python -m tests.net [--full] [--seconds 12] [--delays 0,1,5] [--losses 0,1,5] [--seed 1] [--incidents cable,router] [--json FILE]
+    python -m tests.net [--full] [--seconds 12] [--delays 0,1,5] [--losses 0,1,5] [--incidents cable,router] [--seed 1] [--json F]
 
 Needs root: it makes namespaces, links and a TUN device (`lab.py`), all of which go with it. Every computer has a network and a
 monotonic clock of its own; they speak TLS. Each cell of delay (ms, one way) and loss (%) is T2 for `--seconds` armed, with --full
@@ -83,7 +83,12 @@ def show(cells, incidents):
     console = Console(width=150)
     console.print(table)
     for one in (one for one in incidents if "back_s" in one):
-        what = f"no current in the charge coil {one['vented_ms']:.0f} ms after the loss"
+        seen = (
+            f"vented {one['vented_ms']:.0f} ms after the loss"
+            if one["vented_ms"] < 1e9
+            else "vented while nothing could be logged"
+        )
+        what = f"{seen}, {one['charge_back_ma']:.1f} mA in the charge coil on the return"
         back = f"all channels back after {one['back_s']:.2f} s; restarted: {len(one['restarted'])}"
         again = f"armed again: {'yes' if one['armed_again'] else 'no'}"
         console.print(f"{one['incident']}: {what}; {back}; {again}", soft_wrap=True, highlight=False)
