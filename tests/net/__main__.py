@@ -10,6 +10,7 @@ machine cannot, 130.
 
 import argparse
 import json
+import math
 import signal
 import sys
 from contextlib import ExitStack
@@ -113,6 +114,15 @@ def parsed():
     return parser.parse_args()
 
 
+def finite(found):
+    """What JSON can hold: a number that is none becomes null."""
+    if isinstance(found, dict):
+        return {str(key): finite(value) for key, value in found.items()}
+    if isinstance(found, list | tuple):
+        return [finite(value) for value in found]
+    return None if isinstance(found, float) and not math.isfinite(found) else found
+
+
 def numbers(text):
     return [float(word) for word in text.split(",") if word]
 
@@ -139,7 +149,7 @@ def run(options) -> int:
         show(cells, incidents)
         found = {"full": options.full, "seconds": None if options.full else options.seconds, "seed": options.seed}
         found |= {"cells": [asdict(c) | {"outcome": c.outcome} for c in cells], "incidents": incidents}
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
+        options.json.write_text(json.dumps(finite(found), indent=1) + "\n")
     return 1 if failed_of(cells, incidents) else 0
 
 
