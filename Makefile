@@ -11,7 +11,7 @@ SOURCES := wire dynamics devices plant controller watch offline deploy tests ben
 
 CHROMIUM ?= /usr/bin/chromium
 
-.PHONY: help setup demo test exact test-page test-docs test-long test-rerun kill mutate fuzz monitor rearm flood lint lock clean
+.PHONY: help setup demo test exact test-page test-docs test-long test-rerun test-net kill mutate fuzz monitor rearm flood lint lock clean
 
 help:
 	@echo 'make demo   set up, then run the two demonstration trajectories on the simulated rig'
@@ -19,6 +19,7 @@ help:
 	@echo 'make exact  set up, then the three exactness contracts for every law, with both cores kept busy'
 	@echo 'make test-page  the live page in a real browser (Debian: apt install chromium)'
 	@echo 'make test-long  whole rigs on several hosts, over TLS, several at once, under the doctor'
+	@echo 'make test-net   a rig on three hosts in network namespaces, with delay, loss and cut cables (root); NET=--full: all of it'
 	@echo 'make test-docs  every command of the documentation, run'
 	@echo 'make test-rerun  logs in the reader of rerun, which is installed for it'
 	@echo 'make docs   the documentation as pages, in docs/_build/html'
@@ -46,7 +47,7 @@ demo: $(STAMP)
 # Two at a time, by file; those of a whole rig come last and one at a time: they need the machine for themselves.
 test: $(STAMP)
 	$(BIN)/softloop warm
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not rig and not exact and not page and not commands and not long and not rerun'
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not rig and not exact and not page and not commands and not long and not rerun and not net'
 	$(BIN)/python -m pytest -m 'rig and not page and not long'
 
 # The live page in Debian's chromium, a whole rig behind it in the last tests; other browsers by CHROMIUM=PATH.
@@ -92,6 +93,14 @@ test-long: $(STAMP)
 test-rerun: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --editable '.[rerun]'
 	$(BIN)/python -m pytest -m rerun tests/offline/test_rerun.py
+
+# Three computers of namespaces, a network between them that delays and loses. Needs root: else one line, and exit code 3 of the
+# program, which make shows as its own 2.
+test-net: $(STAMP)
+	@$(BIN)/python -m tests.net.needs
+	$(BIN)/softloop warm
+	$(BIN)/python -m pytest -m net tests/net
+	$(BIN)/python -m tests.net $(NET)
 
 # Every command that the documentation shows, run as it stands there, but shorter.
 test-docs: $(STAMP)

@@ -290,8 +290,8 @@ def router(
 ) -> int:
     """Be the meeting point of a bench until Ctrl-C, for benches with `[run] shared_router = true`."""
     from softloop.deploy.bench import find_bench, load_bench
-    from softloop.deploy.launcher import stop_on_signals
     from softloop.deploy.router import run_router
+    from softloop.deploy.signals import stop_on_signals
     from softloop.deploy.zenohd import find_zenohd
 
     with stop_on_signals() as stop:

@@ -23,11 +23,11 @@ from softloop.deploy.doctor_devices import devices, is_real
 from softloop.deploy.doctor_host import disk, existing, lateness, library_versions, permissions, zenoh
 from softloop.deploy.doctor_identity import identities
 from softloop.deploy.hosts import choose_host, shares
-from softloop.deploy.launcher import stop_on_signals
 from softloop.deploy.prepare import prepare_in_child
 from softloop.deploy.progress import compile_progress
 from softloop.deploy.router import launcher_wire
 from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench
+from softloop.deploy.signals import stop_on_signals
 from softloop.wire.clock import WallClock
 from softloop.wire.config import PaceConfig, ZenohConfig
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, Interrupted, SoftloopError, Unavailable

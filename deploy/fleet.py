@@ -35,6 +35,8 @@ _WORD_S = 1.0 / HOST.rate_hz
 _POLL_S = 0.05
 _ASK_S = 1.0  # all answer within some ms, but for a machine that is very busy
 CLOCK_SILENT_S = 5.0
+QUIET_S = 0.8  # four words that are missing: less than `deploy.launcher` waits for the gate
+JUDGED_S = 1.5  # after this it is known whether a FAULT came of a host that is not heard
 SEEN_S = 3.0  # who was alive so lately is: a busy machine answers late
 
 Ending = tuple[int, str]  # exit code, and one line
@@ -46,6 +48,7 @@ class Alone:
     host = ""
     leads = True
     number = 0
+    judged_s = 0.0  # for so long a FAULT may still turn out to come of a host that is not heard
 
     def __init__(self) -> None:
         self.clock: Clock = WallClock()
@@ -59,6 +62,10 @@ class Alone:
 
     def missing(self) -> list[str]:
         """What the run still needs of other hosts, in words."""
+        return []
+
+    def quiet(self) -> list[tuple[int, str]]:
+        """Number and name of the hosts that were heard in this run, and are not now."""
         return []
 
     def look(self) -> None:
@@ -103,6 +110,8 @@ class Fleet(Alone):
 
     `on_clock` is told of what happens to another host's clock: CLOCK_*, host number, value.
     """
+
+    judged_s = JUDGED_S
 
     def __init__(
         self, bench: Bench, host: str, wire: Wire, digest: int, on_clock: Callable[[int, int, float], None] = lambda *_: None
@@ -229,6 +238,13 @@ class Fleet(Alone):
         if host == self.leader and self._seen[host].word.state != RUNNING:
             return [f"the word of host '{host}', which leads"]
         return []
+
+    def quiet(self) -> list[tuple[int, str]]:
+        if not self.leads or self._word[0] != RUNNING:
+            return []
+        now_s = time.monotonic()
+        silent = [host for host, seen in list(self._seen.items()) if now_s - seen.heard_s > QUIET_S]
+        return [(number_of(self.bench, host), host) for host in silent]
 
     def _unsure(self, number: int) -> bool:
         seen = self._clocks.get(number)

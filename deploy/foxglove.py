@@ -7,7 +7,7 @@ from importlib import resources
 from pathlib import Path
 
 from softloop.deploy.bench import find_bench, load_bench
-from softloop.deploy.launcher import stop_on_signals
+from softloop.deploy.signals import stop_on_signals
 from softloop.watch.foxglove import Bridge, serve
 from softloop.watch.guest import guest_wire
 from softloop.wire.errors import EXIT_OK, BadFile

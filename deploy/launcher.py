@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-import signal
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Literal, Self
 
 from softloop.deploy.bench import Bench, folders_of, load_bench
@@ -32,6 +30,7 @@ from softloop.deploy.rig_state import GATE_FAULT, RigState
 from softloop.deploy.rotate import in_use, keeping_budget, make_room
 from softloop.deploy.router import launcher_wire, remove_sockets
 from softloop.deploy.run_dir import BENCH_FILE, bench_lock, keep_bench, keep_certificate, make_run_dir
+from softloop.deploy.signals import stop_on_signals
 from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_LOST, EXIT_NEGATIVE, EXIT_OK, BadConfig
 from softloop.wire.session import Wire
 from softloop.wire.shell import Stop
@@ -134,23 +133,6 @@ def _with_options(bench: Bench, options: Options) -> Bench:
     return bench.model_copy(update={"run": bench.run.model_copy(update=changed), "pace": paced})
 
 
-@contextmanager
-def stop_on_signals() -> Iterator[Stop]:
-    """A `Stop` that Ctrl-C, SIGTERM and a closed terminal set, instead of what they do otherwise."""
-    stop = Stop()
-
-    def on_signal(number: int, _frame: FrameType | None) -> None:
-        stop.set(signal.Signals(number).name)
-
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = [signal.signal(number, on_signal) for number in numbers]
-    try:
-        yield stop
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
-
-
 class Launch:
     """One run of a bench, from the first process started to the last one gone."""
 
@@ -179,7 +161,7 @@ class Launch:
         self.code = EXIT_LOST
         events = LauncherEvents(wire, self.fleet.clock, None if self.fleet.leads else self.fleet.number)
         watched = bench.run.shared_router or not self.fleet.leads
-        self.meeting = Meeting(wire, watched=watched, say=view.say, tell=events.router)
+        self.meeting = Meeting(wire, watched=watched, say=view.say, tell=events.router, tell_host=events.host)
         self.keeper = Keeper(view.say, events.process)
         self.words: dict[str, str] = {}
         self.all_alive = False
@@ -322,7 +304,7 @@ class Launch:
         elsewhere = self._without_router() or self._of_fleet()
         if elsewhere is not None:
             return elsewhere
-        if self.state.gate == GATE_FAULT and not self.meeting.excuses and not self.meeting.awaits_arming:
+        if self.state.gate == GATE_FAULT and self.meeting.fault_counts(self.fleet.judged_s):
             return Outcome(EXIT_NEGATIVE, f"the gate went to FAULT: {self.state.reason}")
         if self.meeting.excuses:
             return None
@@ -349,7 +331,7 @@ class Launch:
 
     def _of_fleet(self) -> Outcome | None:
         """Why the run cannot go on, as far as other hosts are concerned."""
-        ending = self.fleet.trouble(excused=self.meeting.excuses)
+        ending = self.fleet.trouble(excused=self.meeting.excuses_hosts)
         return None if ending is None else Outcome(*ending)
 
     def _lost(self, child: Child) -> Outcome:
@@ -390,7 +372,7 @@ class Launch:
     def _refresh(self, stage: str) -> None:
         for line in self.state.refresh():
             self.view.say(line)
-        self.meeting.look(self.state.reason if self.state.gate == GATE_FAULT else None)
+        self.meeting.look(self.state.reason if self.state.gate == GATE_FAULT else None, self.fleet.quiet())
         self.fleet.look()
         self.injector.act(self.state)
         self.keeper.look(time.monotonic())

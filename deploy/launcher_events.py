@@ -12,7 +12,7 @@ _EVENT = message("Event")
 _SOURCE = constant("Event", "SOURCE_LAUNCHER")
 _PROCESS, _FAULT = constant("Event", "KIND_PROCESS"), constant("Event", "KIND_FAULT")
 _SOURCE_HOST = constant("Event", "SOURCE_HOST")
-_CLOCK, _ROUTER = constant("Event", "KIND_CLOCK"), constant("Event", "KIND_ROUTER")
+_CLOCK, _ROUTER, _HOST = (constant("Event", f"KIND_{kind}") for kind in ("CLOCK", "ROUTER", "HOST"))
 SOURCES = {process.name: constant("Event", process.source) for process in PROCESSES}
 
 
@@ -37,6 +37,10 @@ class LauncherEvents:
     def router(self, back: bool, seconds: float) -> None:
         """The shared meeting point was lost, or is back after so many `seconds`. Nobody behind it hears the former."""
         self._say(_ROUTER, int(back), 0, seconds)
+
+    def host(self, number: int, back: bool, seconds: float) -> None:
+        """A host is not heard any more, or is again after so many `seconds`."""
+        self._say(_HOST, int(back), number, seconds)
 
     def fault(self, reason: int, code: int) -> None:
         """An injection (FAULT_*) began (1) or ended (0)."""

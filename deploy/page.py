@@ -17,8 +17,8 @@ from softloop.deploy.bench import Bench, find_bench, load_bench
 from softloop.deploy.children import PROGRAM
 from softloop.deploy.experiments import Experiments
 from softloop.deploy.fault_requests import offer_faults
-from softloop.deploy.launcher import stop_on_signals
 from softloop.deploy.rig_state import event_line
+from softloop.deploy.signals import stop_on_signals
 from softloop.deploy.watching import overview_of
 from softloop.watch.page.app import Site
 from softloop.watch.page.feed import Feed

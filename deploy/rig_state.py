@@ -130,6 +130,9 @@ def _event_text(event: Any) -> str:
         return f"clock of host {event.reason}: {CLOCKS.get(event.code, event.code)} ({event.value:.4g} {unit})"
     if kind == "router":
         return f"the meeting point is back after {event.value:.1f} s" if event.code else "the meeting point was lost"
+    if kind == "host":
+        again = f"is heard again after {event.value:.1f} s"
+        return f"host {event.reason} {again if event.code else 'is not heard'}"
     if kind == "driver":
         return f"valve driver {DRIVERS.get(event.code, event.code)}"
     if kind == "bus":

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.live import Live
 
 from softloop.deploy.bench import Bench, find_bench, load_bench
-from softloop.deploy.launcher import stop_on_signals
 from softloop.deploy.node import PROCESSES
+from softloop.deploy.signals import stop_on_signals
 from softloop.devices.protocols.wire_time import can_frame_ns
 from softloop.plant.config import emulated_buses
 from softloop.watch.echo import choose, writer

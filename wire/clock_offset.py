@@ -16,6 +16,7 @@ RATE_SPAN_NS = 1_000_000_000  # for the clocks' rate, the best exchange of each 
 RATE_SPANS = 64
 # What the middle of an exchange may move by itself where its round trip says that it did not: reading clocks takes time.
 SHIFT_NS = 50_000
+QUICK = 1.5  # times the shortest round trip that is remembered: as good a witness
 # What bridges a gap at this rate or less since the last exchange is drift; what does not has jumped.
 PLAUSIBLE_PPM = 2000.0
 READING_NS = 1_000  # two clocks are not read in the very same instant
@@ -121,9 +122,13 @@ class OffsetEstimator:
         gap_ns = abs(apart_ns) - self._bound_ns(best, now_ns) - self._bound_ns(new, now_ns)
         if gap_ns > 0:  # both cannot be true of one clock
             return self._contradicted(new, apart_ns, gap_ns)
-        if abs(apart_ns) > self._may_shift_ns(best, new):  # it may, but either the way or the clock is another now
-            self._recent.clear()
+        if self._is_quick(new) and abs(apart_ns) > self._may_shift_ns(best, new):
+            self._recent.clear()  # both may be true, but either the way or the clock is another now
         return 0
+
+    def _is_quick(self, new: Exchange) -> bool:
+        """One that waited long knows little: it may not make what is known better forgotten."""
+        return new.delay_ns <= QUICK * min(e.delay_ns for e in self._recent) + SHIFT_NS
 
     def _contradicted(self, new: Exchange, apart_ns: int, gap_ns: int) -> int:
         since_ns = max(1, new.answered_ns - self._recent[-1].answered_ns)

@@ -68,3 +68,29 @@ def test_a_launcher_that_is_the_meeting_point_watches_nothing(world):
     routers.clear()
     meeting.look(None)
     assert (meeting.away_s, meeting.excuses, said) == (0.0, False, [])
+
+
+def test_a_host_that_is_not_heard_for_a_while_excuses_a_fault_once_it_is_back(world):
+    now, _, said, told, meeting = world
+    meeting.look(None)
+    meeting.look("not ready")
+    assert not meeting.fault_counts(1.5)  # the silence of a host is known later than what it leads to
+    assert meeting.fault_counts(0.0)
+    now.value += 0.8
+    meeting.look("not ready", [(1, "board")])
+    assert (meeting.excuses, meeting.excuses_hosts, meeting.awaits_arming) == (True, False, False)
+    now.value += 2.0
+    assert not meeting.fault_counts(1.5)
+    meeting.look("not ready")
+    assert meeting.awaits_arming
+    assert said[:2] == [
+        "host 'board' is not heard; the run goes on if it is back soon",
+        "host 'board' is heard again after 2.0 s",
+    ]
+    assert told == []
+    meeting.look(None)
+    now.value += 10 * EXCUSE_S
+    meeting.look("over pressure")
+    now.value += 1.5
+    meeting.look("over pressure")
+    assert meeting.fault_counts(1.5)

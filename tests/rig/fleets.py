@@ -53,10 +53,9 @@ def bench_text(name, *, mode, shared_router=False, base=None, more=""):
 class Host:
     """One host's launcher, by its command line."""
 
-    def __init__(self, fleet, name, ahead_s, report):
+    def __init__(self, fleet, name, inside, report):
         self.name, self.run_dir, self.words = name, fleet.folder / name, fleet.folder / f"{name}.txt"
-        own_clock = ["unshare", "--time", f"--monotonic={ahead_s}", "--fork", "--kill-child"] if ahead_s else []
-        command = [*own_clock, *CLI, "run", str(fleet.bench), "--host", name, "--run-dir", str(self.run_dir)]
+        command = [*inside, *CLI, "run", str(fleet.bench), "--host", name, "--run-dir", str(self.run_dir)]
         command += [] if report else ["--no-report"]
         with self.words.open("w") as output:
             self.popen = subprocess.Popen(
@@ -96,15 +95,17 @@ class Fleet:
         self.hosts, self.seen, self.routers = {}, {}, []
         self.began = time.monotonic()
 
-    def start(self, name, ahead_s=0, report=False):
-        self.hosts[name] = Host(self, name, ahead_s, report)
+    def start(self, name, ahead_s=0, report=False, inside=()):
+        """Start a host's launcher, with a clock that is ahead or `inside` namespaces: the command that runs another in them."""
+        own_clock = ["unshare", "--time", f"--monotonic={ahead_s}", "--fork", "--kill-child"] if ahead_s else []
+        self.hosts[name] = Host(self, name, [*inside, *own_clock], report)
         return self.hosts[name]
 
-    def start_router(self):
+    def start_router(self, inside=()):
         """Start `softloop router`; returns when it says that it is there."""
         words = self.folder / f"router-{len(self.routers)}.txt"
         with words.open("w") as output:
-            command = [*CLI, "router", str(self.bench), "--with", "softloop"]
+            command = [*inside, *CLI, "router", str(self.bench), "--with", "softloop"]
             self.routers.append(subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=self.environment))
         while "meeting point of bench" not in words.read_text():
             assert self.routers[-1].poll() is None, words.read_text()

@@ -1,12 +1,11 @@
 """A rig of processes on an emulated CAN bus: arbitration, load, bus-off and recovery, and where it must, a vent."""
 
-from itertools import pairwise
-
 import subprocess
 import sys
 import threading
 import time
 from contextlib import ExitStack
+from itertools import pairwise
 
 import can
 import numpy as np

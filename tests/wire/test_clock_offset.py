@@ -174,3 +174,12 @@ def test_a_host_clock_takes_the_word_on_its_own_host_alone():
     assert not clock.known
     clock.take(kind.pack(kind.make(host=1, offset_ns=7)))
     assert (clock.known, clock.now_ns()) == (True, 7)
+
+
+def test_an_exchange_that_waited_long_makes_nothing_forgotten():
+    """Its middle is far off where it waited on one way alone, and the first ones did not go the shortest way either."""
+    estimator = OffsetEstimator(100.0, MS)
+    estimator.add(Exchange(0, 1 * MS, 1 * MS, 1 * MS + 10_000))
+    assert estimator.at(2 * MS).uncertainty_ns < 0.6 * MS
+    estimator.add(Exchange(100 * MS, 100 * MS + 10_000, 100 * MS + 10_000, 120 * MS))
+    assert estimator.at(121 * MS).uncertainty_ns < 0.6 * MS
