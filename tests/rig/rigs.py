@@ -12,9 +12,21 @@ import time
 from pathlib import Path
 
 import psutil
+import pytest
 
 LIMIT_S = 120.0
 PROGRAM = (sys.executable, "-m", "softloop.deploy.cli")
+STALLED = "the plant was late by"  # the run's own words for a machine that did not let it run
+
+
+class MachineStalled(AssertionError):
+    """A rig at wall pace ended otherwise than expected, and its own summary says that the machine did not keep pace.
+
+    Such a run proves nothing either way: it is tried again (`stands_stalls`), a few times.
+    """
+
+
+stands_stalls = pytest.mark.flaky(reruns=2, only_rerun=["MachineStalled"])
 
 
 class Rig:
@@ -47,6 +59,7 @@ class Rig:
                         yield words[words.index("node") + 1], child
 
     def named(self, name):
+        self.wait_for(lambda: name in dict(self.children()), f"process '{name}'")
         return dict(self.children())[name]
 
     def wait_for(self, condition, what):
@@ -54,7 +67,7 @@ class Rig:
         while not condition():
             list(self.children())
             assert time.monotonic() - self.started < LIMIT_S, f"{what}: not within {LIMIT_S} s\n{self.logs()}"
-            assert self.process.poll() is None, f"the rig ended before: {what}\n{self.output}\n{self.logs()}"
+            self._expect(self.process.poll() is None, f"the rig ended before: {what}")
             time.sleep(0.05)
 
     def wait_for_word(self, word):
@@ -73,8 +86,12 @@ class Rig:
             assert time.monotonic() - self.started < LIMIT_S, f"the rig did not end\n{self.output}\n{self.logs()}"
             time.sleep(0.1)
         code = self.process.returncode
-        assert not allowed or code in allowed, f"exit code {code}, not one of {allowed}\n{self.output}\n{self.logs()}"
+        self._expect(not allowed or code in allowed, f"exit code {code}, not one of {allowed}")
         return code
+
+    def _expect(self, fulfilled, words):
+        if not fulfilled:
+            raise (MachineStalled if STALLED in self.output else AssertionError)(f"{words}\n{self.output}\n{self.logs()}")
 
     def signal(self, number):
         self.process.send_signal(number)

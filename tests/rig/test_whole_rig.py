@@ -15,9 +15,9 @@ from softloop.offline.metrics import truth_errors, while_armed
 from softloop.offline.run_log import open_run
 from softloop.wire.channels import CHANNELS
 from softloop.wire.messages import constant
-from tests.rig.rigs import running
+from tests.rig.rigs import running, stands_stalls
 
-pytestmark = pytest.mark.rig
+pytestmark = [pytest.mark.rig, stands_stalls]
 
 # These tests are about what the processes do, on a machine that may be busy: budgets are wide, so that a stall of the machine is
 # no fault of the rig's. What the default budgets stand is measured elsewhere.
