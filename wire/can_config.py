@@ -31,9 +31,7 @@ class EmulationConfig(Table):
     queue_frames: int = Field(64, ge=1, le=4096, description="of one node that wait for the bus at most; more are refused")
     error_rate: float = Field(0.0, ge=0, le=0.5, description="how likely a transmission is destroyed by chance")
     seed: int = Field(1, ge=0, description="of that chance")
-    bus_errors: bool = Field(
-        False, description="also tell a node of each failed transmission; wall pace only"
-    )
+    bus_errors: bool = Field(False, description="also tell a node of each failed transmission; wall pace only")
 
 
 class CanConfig(Table):

@@ -1,5 +1,6 @@
 """A rig of processes on an emulated CAN bus: arbitration, load, bus-off and recovery, and where it must, a vent."""
 
+import itertools
 import subprocess
 import sys
 import threading
@@ -49,11 +50,11 @@ GUEST_ID, GUEST_S = 0x7FF, 1.5
 
 def serialised(log, bitrate=500_000):
     """The data frames of a log by their ends, each with the time between the end before it and its own start, ns."""
-    rows = np.concatenate([frames for frames in log.can.values()])
+    rows = np.concatenate(list(log.can.values()))
     rows = rows[(rows["flags"] & FLAG_ERROR) == 0]
     rows = rows[np.argsort(rows["stamp_ns"], kind="stable")]
     gaps = []
-    for before, row in zip(rows[:-1], rows[1:], strict=True):
+    for before, row in itertools.pairwise(rows):
         frame = CanFrame(0, 0, 0, int(row["arbitration_id"]), int(row["flags"]), int(row["dlc"]), bytes(row["data"]))
         gaps.append(int(row["stamp_ns"]) - frame_bits(frame) * 1_000_000_000 // bitrate - int(before["stamp_ns"]))
     return rows, np.array(gaps)

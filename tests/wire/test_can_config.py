@@ -115,7 +115,7 @@ def test_table_defaults_and_faults():
         (
             {"chanel": "can0"},
             "unknown key 'chanel'; allowed here: bitrate, channel, emulation, interface, mirror, open_wait_s, options, "
-                "send_timeout_ms",
+            "send_timeout_ms",
         ),
         ({"bitrate": 1}, "bitrate"),
         ({"options": {"channel": "x", "bitrate": 1}}, "bitrate, channel cannot stand in options"),
