@@ -189,6 +189,7 @@ def _check_together(bench: Bench, source: Source) -> None:
     if bench.pace.mode == "lockstep":
         _check_lockstep(bench, source)
     _check_buses(bench, source)
+    _check_router(bench, source)
     try:
         check_hosts(bench)
     except BadConfig as error:
@@ -210,6 +211,16 @@ def _check_buses(bench: Bench, source: Source) -> None:
     for injection in bench.faults.injections:
         if injection.family == "bus" and names[injection.target != "analog"] not in emulated:
             raise BadConfig(f"{source.file}: key 'faults.injections': kind '{injection.kind}' needs a [can.NAME.emulation]")
+
+
+def _check_router(bench: Bench, source: Source) -> None:
+    """A meeting point that is to be lost is neither the launcher nor another host's affair. Raises BadConfig."""
+    lost = any(injection.family == "router" for injection in bench.faults.injections)
+    if lost and (not bench.run.shared_router or bench.hosts):
+        raise BadConfig(
+            f"{source.file}: key 'faults.injections': kind 'router_loss' needs [run] shared_router = true, on one host; the run "
+            "then starts its router itself"
+        )
 
 
 def _check_lockstep(bench: Bench, source: Source) -> None:

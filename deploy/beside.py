@@ -17,6 +17,11 @@ FIRST_WORD_S = 20.0
 POLL_S = 0.2
 
 
+def onlookers(bench_file: Path, page: bool, foxglove: bool) -> list[list[str]]:
+    """The commands that look at a run from outside."""
+    return [[name, str(bench_file)] for name, wanted in (("page", page), ("foxglove", foxglove)) if wanted]
+
+
 @contextlib.contextmanager
 def beside(commands: list[list[str]], run_dir: Path, say: Callable[[str], None]) -> Iterator[list[Kept]]:
     """Run `softloop COMMAND` for each while the block lasts, its words in `COMMAND.log`, the first one said.

@@ -287,14 +287,18 @@ def router(
         Literal["auto", "zenohd", "softloop"],
         typer.Option("--with", help="auto: zenohd where it is installed, else softloop itself."),
     ] = "auto",
+    lifeline_fd: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> int:
     """Be the meeting point of a bench until Ctrl-C, for benches with `[run] shared_router = true`."""
     from softloop.deploy.bench import find_bench, load_bench
     from softloop.deploy.router import run_router
     from softloop.deploy.signals import stop_on_signals
     from softloop.deploy.zenohd import find_zenohd
+    from softloop.wire.shell import watch_lifeline
 
     with stop_on_signals() as stop:
+        if lifeline_fd is not None:
+            watch_lifeline(lifeline_fd, stop)
         run_router(load_bench(find_bench(bench)), stop, find_zenohd(program))
     return EXIT_OK
 

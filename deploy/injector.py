@@ -10,12 +10,14 @@ from pathlib import Path
 from softloop.deploy.bench import Bench
 from softloop.deploy.children import Child, Children
 from softloop.deploy.launcher_events import LauncherEvents
+from softloop.deploy.own_router import OwnRouter
 from softloop.deploy.rig_state import RigState
 from softloop.wire.clock import Clock, WallClock
 from softloop.wire.fault_config import LAUNCHER, InjectionConfig
 from softloop.wire.faults import NUMBERS
 
 _S = 1_000_000_000
+BACK_S = 2.0  # measured: a router that is back is joined by all within that; see docs/hosts.md
 
 
 class Injector:
@@ -32,15 +34,18 @@ class Injector:
     ) -> None:
         self._waiting = [injection for _, injection in bench.faults.of_process(LAUNCHER)]
         self._standing: list[InjectionConfig] = []
+        self._untold: list[tuple[InjectionConfig, int, int]] = []  # what nobody could hear: (injection, came or left, when)
+        self._back_ns: int | None = None
+        self.router: OwnRouter | None = None
         self._children, self._start = children, start
         self._log = run_dir / bench.recorder.file if bench.recorder is not None else run_dir
         self._events = events
         self._clock = clock or WallClock()
         self._armed_ns: int | None = None
 
-    def act(self, state: RigState) -> None:
-        """Begin and end what is due now."""
-        if not self._waiting and not self._standing:
+    def act(self, state: RigState, *, there: bool = True) -> None:
+        """Begin and end what is due now; `there`: the meeting point is."""
+        if not self._waiting and not self._standing and not self._untold:
             return
         if self._armed_ns is None and state.armed:
             self._armed_ns = int(state.valves.stamp_ns)
@@ -49,15 +54,35 @@ class Injector:
         since_s = (self._clock.now_ns() - self._armed_ns) / _S
         for injection in [i for i in self._waiting if i.at_s <= since_s]:
             self._waiting.remove(injection)
-            if self._alive(injection) is None:
+            if injection.family != "router" and self._alive(injection) is None:
                 continue
             self._standing.append(injection)
-            self._events.fault(NUMBERS[injection.kind], 1)
+            self._tell(injection, 1)
             self._begin(injection)
         for injection in [i for i in self._standing if i.at_s + i.duration_s <= since_s]:
             self._standing.remove(injection)
             self._end(injection)
-            self._events.fault(NUMBERS[injection.kind], 0)
+            self._tell(injection, 0)
+        self._tell_late(there=there)
+
+    def _tell(self, injection: InjectionConfig, code: int) -> None:
+        if injection.family == "router":
+            self._untold.append((injection, code, self._clock.now_ns()))
+        else:
+            self._events.fault(NUMBERS[injection.kind], code)
+
+    def _tell_late(self, *, there: bool) -> None:
+        """Tell of a router's loss once all who listen are back behind it."""
+        if not there or not any(code == 0 for _, code, _ in self._untold):
+            self._back_ns = None
+            return
+        now_ns = self._clock.now_ns()
+        self._back_ns = now_ns if self._back_ns is None else self._back_ns
+        if now_ns - self._back_ns < BACK_S * _S:
+            return
+        for injection, code, stamp_ns in self._untold:
+            self._events.fault(NUMBERS[injection.kind], code, stamp_ns)
+        self._untold.clear()
 
     def _alive(self, injection: InjectionConfig) -> Child | None:
         """The process that it is done to; None where that is not there (any more): then nothing is done, and nothing said."""
@@ -65,7 +90,10 @@ class Injector:
         return None if child is None or child.exit_code() is not None else child
 
     def _begin(self, injection: InjectionConfig) -> None:
-        if not self._set(injection, on=True):
+        if injection.family == "router":
+            if self.router is not None:
+                self.router.kill()
+        elif not self._set(injection, on=True):
             child = self._children.all[injection.target]
             child.popen.kill()
             child.popen.wait()
@@ -73,7 +101,10 @@ class Injector:
                 self._start(injection.target)
 
     def _end(self, injection: InjectionConfig) -> None:
-        if self._alive(injection) is not None:
+        if injection.family == "router":
+            if self.router is not None:
+                self.router.start()
+        elif self._alive(injection) is not None:
             self._set(injection, on=False)
 
     def _set(self, injection: InjectionConfig, *, on: bool) -> bool:

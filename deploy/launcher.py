@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 from softloop.deploy.bench import Bench, folders_of, load_bench
-from softloop.deploy.beside import beside
+from softloop.deploy.beside import beside, onlookers
 from softloop.deploy.children import Child, Children
 from softloop.deploy.conclude import conclude
 from softloop.deploy.fleet import READY, RUNNING, STOPPING, Alone, Fleet
@@ -24,6 +24,7 @@ from softloop.deploy.launcher_events import LauncherEvents
 from softloop.deploy.live import View, make_view
 from softloop.deploy.meeting import Meeting
 from softloop.deploy.node import KEPT_PROCESSES, STOP_ORDER, processes_of
+from softloop.deploy.own_router import OwnRouter, own_router
 from softloop.deploy.prepare import prepare_in_child
 from softloop.deploy.progress import compile_progress
 from softloop.deploy.rig_state import GATE_FAULT, RigState
@@ -93,12 +94,13 @@ def launch(bench_file: Path, options: Options, then: Callable[..., int] = _concl
         with (
             closing(make_view(prepared.trajectory_s, quiet=options.quiet)) as view,
             keeping_budget(bench, view.say),
+            own_router(bench, run_dir / BENCH_FILE, run_dir) as router,
             launcher_wire(bench, host, stop, view.say) as wire,
             closing(_fleet(bench, host, wire, same)) as fleet,
-            beside(onlookers(run_dir, options), run_dir, view.say) as viewers,
+            beside(onlookers(run_dir / BENCH_FILE, options.page, options.foxglove), run_dir, view.say) as viewers,
         ):
             launch = launch_class(bench, fleet)(bench, run_dir, wire, view, stop, Children(), prepared.trajectory_s, fleet)
-            outcome = launch.looking_after(viewers).run()
+            outcome = launch.looking_after(viewers, router).run()
         return then(share_of(bench, host), run_dir, outcome, quiet=options.quiet)
 
 
@@ -112,12 +114,6 @@ def launch_class(bench: Bench, fleet: Alone) -> type[Launch]:
     from softloop.deploy.lockstep_launch import LockstepLaunch  # noqa: PLC0415
 
     return FollowLaunch if not fleet.leads else Launch if bench.pace.mode == "wall" else LockstepLaunch
-
-
-def onlookers(run_dir: Path, options: Options) -> list[list[str]]:
-    """The commands that look at the run from outside."""
-    asked = (("page", options.page), ("foxglove", options.foxglove))
-    return [[name, str(run_dir / BENCH_FILE)] for name, wanted in asked if wanted]
 
 
 def _with_options(bench: Bench, options: Options) -> Bench:
@@ -167,8 +163,9 @@ class Launch:
         self.all_alive = False
         self.injector = Injector(bench, run_dir, events, children, self._start_killed, self.fleet.clock)
 
-    def looking_after(self, viewers: Iterable[Kept]) -> Self:
-        """Bring back the viewers too when they die."""
+    def looking_after(self, viewers: Iterable[Kept], router: OwnRouter | None = None) -> Self:
+        """Bring back the viewers too when they die; the router is the injector's."""
+        self.injector.router = router
         for kept in viewers:
             self.keeper.keep(kept, time.monotonic())
         return self
@@ -374,7 +371,7 @@ class Launch:
             self.view.say(line)
         self.meeting.look(self.state.reason if self.state.gate == GATE_FAULT else None, self.fleet.quiet())
         self.fleet.look()
-        self.injector.act(self.state)
+        self.injector.act(self.state, there=self.meeting.away_s == 0.0)
         self.keeper.look(time.monotonic())
         self._show(stage)
 

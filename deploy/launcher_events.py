@@ -42,13 +42,14 @@ class LauncherEvents:
         """A host is not heard any more, or is again after so many `seconds`."""
         self._say(_HOST, int(back), number, seconds)
 
-    def fault(self, reason: int, code: int) -> None:
-        """An injection (FAULT_*) began (1) or ended (0)."""
-        self._say(_FAULT, code, reason, 0.0)
+    def fault(self, reason: int, code: int, stamp_ns: int | None = None) -> None:
+        """An injection (FAULT_*) began (1) or ended (0), now, or when nobody could be told of it."""
+        self._say(_FAULT, code, reason, 0.0, stamp_ns)
 
-    def _say(self, kind: int, code: int, reason: int, value: float) -> None:
+    def _say(self, kind: int, code: int, reason: int, value: float, stamp_ns: int | None = None) -> None:
         self._seq += 1
+        stamp_ns = self._clock.now_ns() if stamp_ns is None else stamp_ns
         event = _EVENT.make(
-            seq=self._seq, stamp_ns=self._clock.now_ns(), source=self._source, kind=kind, code=code, reason=reason, value=value
+            seq=self._seq, stamp_ns=stamp_ns, source=self._source, kind=kind, code=code, reason=reason, value=value
         )
         self._put(_EVENT.pack(event))

@@ -36,6 +36,7 @@ TARGETS: dict[str, dict[str, str]] = {
     "process": dict.fromkeys(PROCESSES, LAUNCHER),
     "clock": {name: name for name in ("valves", "pressures", "inclinometer", "controller")},
     "disk": {"recorder": LAUNCHER},
+    "router": {"": LAUNCHER},
 }
 
 Kind = Literal[
@@ -44,7 +45,7 @@ Kind = Literal[
     "serial_drop", "serial_delay", "serial_duplicate", "serial_reorder", "serial_corrupt",
     "zenoh_drop", "zenoh_delay", "zenoh_duplicate", "zenoh_reorder", "zenoh_corrupt",
     "sensor_stuck", "sensor_bias", "sensor_noise", "sensor_nan",
-    "process_kill", "process_stop", "process_restart", "clock_step", "disk_full",
+    "process_kill", "process_stop", "process_restart", "clock_step", "disk_full", "router_loss",
 ]  # fmt: skip
 
 
@@ -66,7 +67,7 @@ class InjectionConfig(InjectionFields):
 
     @property
     def family(self) -> str:
-        """What it is done to: can, bus, serial, zenoh, sensor, process, clock, disk."""
+        """What it is done to: can, bus, serial, zenoh, sensor, process, clock, disk, router."""
         return self.kind.partition("_")[0]
 
     @property

@@ -117,7 +117,7 @@ def run_process(
     stop = Stop()
     _catch_signals(stop)
     if lifeline_fd is not None:
-        _watch_lifeline(lifeline_fd, stop)
+        watch_lifeline(lifeline_fd, stop)
     granted = realtime and prefer_realtime(process, host)
     sys.setswitchinterval(5e-4)  # a waiting 5 ms loop gets the interpreter back soon after a Zenoh callback took it
     try:
@@ -149,7 +149,7 @@ def _catch_signals(stop: Stop) -> None:
     signal.signal(signal.SIGINT, on_signal)
 
 
-def _watch_lifeline(fd: int, stop: Stop) -> None:
+def watch_lifeline(fd: int, stop: Stop) -> None:
     """The launcher holds the other end of this pipe and never writes: its end of file means that the launcher is gone."""
 
     def wait_for_end() -> None:

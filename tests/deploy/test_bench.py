@@ -71,7 +71,14 @@ def write(folder, text, name="bench.toml"):
             "key 'faults.injections': kind 'bus_disturb' needs a [can.NAME.emulation]",
         ),
         (
-            ("[can.can0]", '[zenoh.tls]\nfolder = "keys"\n[can.can0.emulation]\n[can.can0]'),
+            ("[can.can0]", '[[faults.injections]]\nkind = "router_loss"\nat_s = 1.0\n[can.can0]'),
+            "kind 'router_loss' needs [run] shared_router = true",
+        ),
+        (
+            (
+                "[can.can0]",
+                '[zenoh]\nendpoint = "tls/127.0.0.1:7447"\n[zenoh.tls]\nfolder = "keys"\n[can.can0.emulation]\n[can.can0]',
+            ),
             "key 'can': on a secured bench the gate alone may put valve frames on the wire",
         ),
         (('[inclinometer]\nport = "{run_dir}/inclinometer"', ""), "the gate needs the tables [pressures] and [inclinometer]"),

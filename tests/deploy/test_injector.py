@@ -45,10 +45,10 @@ class Rig:
         )
         self.injector = Injector(bench, tmp_path, LauncherEvents(wire), children, self.started.append)
 
-    def act(self, armed=True):
+    def act(self, armed=True, there=True):
         if armed and not self.state.armed:
             self.state.armed, self.state.valves.stamp_ns = True, time.monotonic_ns()
-        self.injector.act(self.state)
+        self.injector.act(self.state, there=there)
         return [(event.reason, event.code) for event in self.said]
 
     def status(self, wanted):
@@ -124,3 +124,22 @@ def test_a_full_disk_takes_nothing_and_then_takes_again(rig, tmp_path):
     one.act()
     assert write() == "ok"
     assert log.stat().st_size == 250
+
+
+def test_a_router_is_taken_away_given_back_and_told_of_once_all_can_hear_it(rig, monkeypatch):
+    monkeypatch.setattr("softloop.deploy.injector.BACK_S", 0.3)
+    one, done = rig(kind="router_loss", target="", duration_s=0.2), []
+    one.injector.router = SimpleNamespace(kill=lambda: done.append("kill"), start=lambda: done.append("start"))
+    assert one.act() == []
+    assert done == ["kill"]
+    time.sleep(0.25)
+    assert one.act(there=False) == []
+    assert done == ["kill", "start"]
+    time.sleep(0.35)
+    assert one.act(there=False) == []  # it takes its time to come back
+    assert one.act() == []
+    time.sleep(0.35)
+    assert one.act() == [(FAULTS["router_loss"], 1), (FAULTS["router_loss"], 0)]
+    came, left = (event.stamp_ns for event in one.said)
+    assert 0.2e9 <= left - came < 5e9
+    assert one.act() == one.act()

@@ -116,7 +116,7 @@ def test_every_kind_on_the_hosts_side_stands_in_a_shipped_scenario():
 
 
 def test_an_unknown_name_lists_the_shipped_ones():
-    with pytest.raises(BadFile, match="there is no such scenario file; shipped ones go by name: can_"):
+    with pytest.raises(BadFile, match="there is no such scenario file; shipped ones go by name: bus_"):
         find_scenario(Path("nowhere"))
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from softloop.offline.safe_outcome import judge
+from softloop.offline.safe_outcome import bridged, judge
 from softloop.wire.messages import constant, message
 
 MS = 1_000_000
@@ -93,3 +93,27 @@ def test_an_exhaust_that_does_not_open_is_no_vent():
     made = vented(2.1)
     made["exhaust_area_mm2"] = 0.0
     assert judge(made, 2 * S, 4 * S, stayed_armed=False).seen != "VENT"
+
+
+def without(made, from_s, to_s):
+    return made[(made["stamp_ns"] < round(from_s * S)) | (made["stamp_ns"] >= round(to_s * S))]
+
+
+def test_a_gap_in_the_log_is_bridged_by_what_the_truth_behind_it_says():
+    """A router that was away: nobody heard the vent, and both times are known all the same."""
+    made = vented(2.1, closed_s=2.0)
+    for name, from_s in (("charge_off_ns", 2.1), ("exhaust_open_ns", 2.1), ("empty_ns", 2.5)):
+        made[name][made["stamp_ns"] >= round(from_s * S)] = round(from_s * S)
+    heard = without(made, 2.02, 3.0)
+    found = judge(bridged(heard), 2 * S, 4 * S, stayed_armed=False)
+    assert (found.vent_s, found.empty_s) == pytest.approx((0.1, 0.5))
+    assert judge(heard, 2 * S, 4 * S, stayed_armed=False).vent_s == pytest.approx(1.0)  # what the log alone could say
+
+
+def test_nothing_is_put_into_a_log_without_gaps_nor_into_one_in_which_nothing_began():
+    made = vented(2.1)
+    assert (bridged(made) == made).all()
+    assert len(bridged(without(truth(), 2.0, 3.0))) == len(without(truth(), 2.0, 3.0))
+    late = vented(3.5)
+    late["charge_off_ns"][late["stamp_ns"] >= 3.5 * S] = round(3.5 * S)
+    assert len(bridged(without(late, 2.0, 3.0))) == len(without(late, 2.0, 3.0))
