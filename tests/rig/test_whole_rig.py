@@ -21,10 +21,23 @@ pytestmark = [pytest.mark.rig, stands_stalls]
 
 # These tests are about what the processes do, on a machine that may be busy: budgets are wide, so that a stall of the machine is
 # no fault of the rig's. What the default budgets stand is measured elsewhere.
-WIDE = (
-    "[valves]\nage_ticks = 16\nhold_ticks = 12\ndriver_silence_ms = 100.0\n[plant]\nwatchdog_ms = 100.0\n[run]\nreport = false\n"
-)
-SHORT = '[controller]\ntrajectory = "{bench_dir}/short.csv"\napproach_s = 2.0\n'
+WIDE = """
+[valves]
+age_ticks = 16
+hold_ticks = 12
+driver_silence_ms = 100.0
+[plant]
+watchdog_ms = 100.0
+[run]
+report = false
+"""
+SHORT = """
+[controller]
+trajectory = "{bench_dir}/short.csv"
+approach_s = 2.0
+pressure_budget_ms = 100.0
+inclination_budget_ms = 100.0
+"""
 ARMED = "gate armed"
 
 
