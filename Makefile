@@ -11,7 +11,7 @@ SOURCES := wire dynamics devices plant controller watch offline deploy tests ben
 
 CHROMIUM ?= /usr/bin/chromium
 
-.PHONY: help setup demo test exact test-page test-docs test-long test-net kill mutate fuzz monitor rearm flood lint lock clean
+.PHONY: help setup demo test exact test-page test-docs test-long test-net test-rerun kill mutate fuzz monitor rearm flood lint lock clean
 
 help:
 	@echo 'make demo   set up, then run the two demonstration trajectories on the simulated rig'
@@ -21,6 +21,7 @@ help:
 	@echo 'make test-long  whole rigs on several hosts, over TLS, several at once, under the doctor'
 	@echo 'make test-net   a rig on three hosts in network namespaces, with delay, loss and cut cables (root); NET=--full: all of it'
 	@echo 'make test-docs  every command of the documentation, run'
+	@echo 'make test-rerun  logs in the reader of rerun, which is installed for it'
 	@echo 'make docs   the documentation as pages, in docs/_build/html'
 	@echo 'make kill, make mutate, make fuzz, make monitor, make rearm, make flood   the long campaigns, see docs/campaigns.md'
 	@echo 'make lint   ruff, mypy and the rules of who may import whom'
@@ -46,8 +47,8 @@ demo: $(STAMP)
 # Two at a time, by file; those of a whole rig come last and one at a time: they need the machine for themselves.
 test: $(STAMP)
 	$(BIN)/softloop warm
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not rig and not exact and not page and not commands and not long and not net'
-	$(BIN)/python -m pytest -m 'rig and not page'
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not rig and not exact and not page and not commands and not long and not net and not rerun'
+	$(BIN)/python -m pytest -m 'rig and not page and not long'
 
 # The live page in Debian's chromium, a whole rig behind it in the last tests; other browsers by CHROMIUM=PATH.
 test-page: $(STAMP)
@@ -95,6 +96,11 @@ test-net: $(STAMP)
 	$(BIN)/softloop warm
 	$(BIN)/python -m pytest -m net tests/net
 	$(BIN)/python -m tests.net $(NET)
+
+# Logs in rerun's own reader. Its library is not locked: 670 MB unpacked, and nothing of softloop needs it.
+test-rerun: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --editable '.[rerun]'
+	$(BIN)/python -m pytest -m rerun tests/offline/test_rerun.py
 
 # Every command that the documentation shows, run as it stands there, but shorter.
 test-docs: $(STAMP)

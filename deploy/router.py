@@ -19,12 +19,12 @@ from softloop.wire.config import ZenohConfig
 from softloop.wire.errors import Interrupted, Lost, Unavailable
 from softloop.wire.identity import identity_of
 from softloop.wire.rights import ROUTER
-from softloop.wire.session import UNIX, Wire, open_router, open_session
+from softloop.wire.session import UNIX, Wire, open_router, open_session, open_wire
 from softloop.wire.shell import Stop
 
 POLL_S = 0.1
 JOIN_S = 3.0  # joining takes well under a tenth of a second
-ALONE_S = 1.0  # what a router knows comes to a new session within milliseconds, on a busy machine within some tenths of a second
+ALONE_S = 0.5  # a router answers within milliseconds, on a busy machine within some tenths of a second
 
 
 @contextmanager
@@ -48,7 +48,7 @@ def launcher_wire(bench: Bench, host: str = "", stop: Stop | None = None, say: C
                 session = stack.enter_context(open_router(config, bench.name))
         wire = Wire(session, bench.name, name, identity)
         if joins:
-            _be_alone(wire, bench.zenoh.meeting_point(bench.name), _own_names(bench, host, name))
+            _be_alone(config, bench.name, name, _own_names(bench, host, name))
         wire.declare_alive()
         yield wire
 
@@ -94,19 +94,21 @@ def _try_to_join(config: ZenohConfig, bench: str, name: str, patience_s: float, 
     return None
 
 
-def _be_alone(wire: Wire, where: str, own: set[str] | None) -> None:
-    """See that nobody else is there for this bench, or nobody of this host.
+def _be_alone(config: ZenohConfig, bench: str, name: str, own: set[str] | None) -> None:
+    """See that nobody else is there for this bench, or nobody of this host. Raises Unavailable when somebody is.
 
-    Asked again for a while: a router that was just joined may answer before it has told who is there.
+    The router itself is asked, by a client, for a while: what a peer is told in the moment it joins can be lost to it for good.
     """
     deadline = time.monotonic() + ALONE_S
-    while time.monotonic() < deadline:
-        running = wire.processes_alive()
-        if own is not None:
-            running &= own
-        if running:
-            raise Unavailable(f"bench '{wire.bench}' is running already at {where}: {', '.join(sorted(running))}")
-        time.sleep(POLL_S)
+    with open_wire(config.model_copy(update={"mode": "client"}), bench, name) as asks:
+        while time.monotonic() < deadline:
+            running = asks.processes_alive()
+            if own is not None:
+                running &= own
+            if running:
+                where = config.meeting_point(bench)
+                raise Unavailable(f"bench '{bench}' is running already at {where}: {', '.join(sorted(running))}")
+            time.sleep(POLL_S)
 
 
 def remove_sockets(bench: Bench, pid: int) -> None:

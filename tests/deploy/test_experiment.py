@@ -114,6 +114,7 @@ def test_the_papers_numbers_stand_beside_their_laws():
     assert paper_of("arc_eso", "t1") == (None, None)
 
 
+@pytest.mark.long
 def test_from_the_experiment_to_a_run_on_what_was_identified(tmp_path):
     """Pressure experiment, identification, a run with the file: the whole way, by its commands."""
     done = softloop("experiment", "pressure", "sim", "--pace", "batch", "--out", "p", cwd=tmp_path)
@@ -152,6 +153,7 @@ def test_a_limit_that_is_passed_ends_the_experiment_with_exit_code_1(tmp_path):
     assert len(done.stderr.strip().splitlines()) <= 2
 
 
+@pytest.mark.long
 def test_flow_tests_on_a_tank_and_on_the_actuator(tmp_path):
     bench_with(tmp_path, "[controller.valve_test]\nlevels = 4\n", "sim_tank")
     done = softloop("experiment", "valves", "bench.toml", "--pace", "batch", "--out", "v", cwd=tmp_path)

@@ -38,6 +38,7 @@ def test_a_folder_that_holds_something_is_refused(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.long
 def test_a_small_reproduction_leaves_a_page_with_every_table_and_figure(tmp_path):
     words = ("reproduce", "--out", "r", "--rigs", "1", "--seeds", "0:1")
     command = [sys.executable, "-m", "softloop.deploy.cli", *words]

@@ -170,7 +170,7 @@ def test_a_silence_of_the_rig_and_a_lost_server_are_shown(chromium):
                     wait_for(view, LIVE)
                 wait_for(view, "document.body.dataset.connection === 'idle'")
                 assert view.locator("#arm").is_disabled()
-                assert view.locator("#gate").inner_text() == "gate silent"
+                wait_for(view, "document.getElementById('gate').innerText === 'gate silent'")
         with viewing(chromium, "about:blank", wait="", allow=LOST) as view:
             with served(file, port=port) as (_, address):
                 view.goto(address)

@@ -48,7 +48,7 @@ def test_what_the_page_shows_is_logged_and_its_stop_vents(chromium, request, tmp
             asked_ns = time.monotonic_ns()
             view.mouse.down()
             clicked_ns = max(asked_ns, origin_ns + int(view.evaluate("window.clickedAt") * 1e6))
-            assert rig.finish() == 1
+            rig.finish(1)
             wait_for(view, "document.body.dataset.connection === 'lost'")
             assert view.evaluate("softloop.state.gate.state") in ("fault", "silent")
             if shots:
@@ -79,7 +79,7 @@ def test_a_fault_from_the_page_is_shown_and_logged_and_the_gate_reacts(chromium,
             view.click("#inject")
             wait_for(view, "document.getElementById('events').textContent.includes('fault inclinometer_silent came')")
             wait_for(view, "document.getElementById('events').textContent.includes('gate fault (')")
-            assert rig.finish() == 1
+            rig.finish(1)
         log = open_log(rig.run_dir / "run.mcap")
     events = log["event"]
     came = events[(events["kind"] == constant("Event", "KIND_FAULT")) & (events["source"] == constant("Event", "SOURCE_PLANT"))]

@@ -66,13 +66,15 @@ class Rig:
         """What the launcher has printed so far."""
         return self.words.read_text()
 
-    def finish(self):
-        """Wait for the end; returns the exit code."""
+    def finish(self, *allowed):
+        """Wait for the end; returns the exit code, one of those allowed, if any are named. A failure shows the words."""
         while self.process.poll() is None:
             list(self.children())
             assert time.monotonic() - self.started < LIMIT_S, f"the rig did not end\n{self.output}\n{self.logs()}"
             time.sleep(0.1)
-        return self.process.returncode
+        code = self.process.returncode
+        assert not allowed or code in allowed, f"exit code {code}, not one of {allowed}\n{self.output}\n{self.logs()}"
+        return code
 
     def signal(self, number):
         self.process.send_signal(number)

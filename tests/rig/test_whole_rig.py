@@ -21,7 +21,9 @@ pytestmark = pytest.mark.rig
 
 # These tests are about what the processes do, on a machine that may be busy: budgets are wide, so that a stall of the machine is
 # no fault of the rig's. What the default budgets stand is measured elsewhere.
-WIDE = "[valves]\nage_ticks = 16\nhold_ticks = 12\ndriver_silence_ms = 100.0\n[plant]\nwatchdog_ms = 100.0\n"
+WIDE = (
+    "[valves]\nage_ticks = 16\nhold_ticks = 12\ndriver_silence_ms = 100.0\n[plant]\nwatchdog_ms = 100.0\n[run]\nreport = false\n"
+)
 SHORT = '[controller]\ntrajectory = "{bench_dir}/short.csv"\napproach_s = 2.0\n'
 ARMED = "gate armed"
 
@@ -44,10 +46,12 @@ def short_bench(tmp_path):
     return bench_on("sim", tmp_path)
 
 
-@pytest.mark.parametrize("law", ["arc", "pid"])
-def test_a_run_tracks_logs_everything_and_leaves_nothing_behind(short_bench, law):
-    with running(short_bench + f'law = "{law}"\n', name=f"whole-{law}") as rig:
-        assert rig.finish() == 0, rig.output + rig.logs()
+@pytest.mark.parametrize("law", ["arc", pytest.param("pid", marks=pytest.mark.long)])
+def test_a_run_starts_vented_tracks_logs_everything_and_leaves_nothing_behind(short_bench, law):
+    """The monitor may fault the gate, and has no reason to."""
+    text = f'{short_bench}law = "{law}"\n[monitor]\nfaults_gate = true\n[run]\nreport = true\n'
+    with running(text, name=f"whole-{law}") as rig:
+        rig.finish(0)
         assert rig.left_over() == []
         assert list(rig.folder.glob("*.sock*")) == []
         log = open_log(rig.run_dir / "run.mcap")
@@ -64,25 +68,22 @@ def test_a_run_tracks_logs_everything_and_leaves_nothing_behind(short_bench, law
                 ["/softloop/whole-" + law + "/cycle"]
             )
             assert len({m.decoded_message.tick for m in decoded}) == len(log["cycle"])
-
-
-def test_it_starts_vented_at_rest_and_ends_vented(short_bench):
-    with running(short_bench, name="vented") as rig:
-        assert rig.finish() == 0, rig.output + rig.logs()
-        truth = open_log(rig.run_dir / "run.mcap")["truth"]
+        truth, monitor = log["truth"], constant("Event", "SOURCE_MONITOR")
         assert truth["chamber_pressure_kpa"][0] < 0.5
         assert truth["angle_deg"][0] == pytest.approx(26.75, abs=3.0)
         assert truth["chamber_pressure_kpa"][-1] < 5.0
         assert truth["charge_coil_ma"][-1] < 1.0
+        assert monitor in log["status"]["process"]
+        assert monitor not in log["event"]["source"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.long), signal.SIGTERM])
 def test_ctrl_c_and_sigterm_vent_and_end(short_bench, number):
     with running(short_bench, name="ctrl-c") as rig:
         rig.wait_for_word(ARMED)
         time.sleep(2.5)
         rig.signal(number)
-        assert rig.finish() == 130
+        rig.finish(130)
         assert rig.left_over() == []
         truth = open_log(rig.run_dir / "run.mcap")["truth"]
         assert truth["chamber_pressure_kpa"].max() > 10.0
@@ -101,13 +102,16 @@ def test_a_killed_launcher_takes_all_with_it_and_the_gate_vents_first(short_benc
         assert last["charge_current_ma"] == 0.0
 
 
-@pytest.mark.parametrize("victim", ["controller", "pressures", "inclinometer", "valves"])
+LESS_OFTEN = [pytest.param(victim, marks=pytest.mark.long) for victim in ("pressures", "inclinometer")]
+
+
+@pytest.mark.parametrize("victim", ["controller", "valves", *LESS_OFTEN])
 def test_a_killed_process_of_the_control_path_ends_in_a_vent_and_is_named(short_bench, victim):
     with running(short_bench, name="lost") as rig:
         rig.wait_for_word(ARMED)
         time.sleep(2.5)
         rig.named(victim).kill()
-        assert rig.finish() in (1, 4)
+        rig.finish(1, 4)
         assert victim in rig.output
         log = open_log(rig.run_dir / "run.mcap")
         truth = log["truth"]
@@ -126,7 +130,7 @@ def test_a_killed_recorder_comes_back_with_a_part_of_its_own_and_the_run_goes_on
         rig.wait_for_word("recorder is back")
         time.sleep(1.0)
         rig.signal(signal.SIGINT)
-        assert rig.finish() == 130, rig.output + rig.logs()
+        rig.finish(130)
         assert rig.left_over() == []
         parts = [open_log(rig.run_dir / name) for name in ("run.mcap", "run-2.mcap")]
         assert [part.finished for part in parts] == [False, True]
@@ -141,6 +145,7 @@ def test_a_killed_recorder_comes_back_with_a_part_of_its_own_and_the_run_goes_on
         assert not rig.summary()["evidence_valid"]
 
 
+@pytest.mark.long
 def test_a_stopped_recorder_does_not_hold_the_loop(short_bench):
     with running(short_bench, name="stalled") as rig:
         rig.wait_for_word(ARMED)
@@ -148,7 +153,7 @@ def test_a_stopped_recorder_does_not_hold_the_loop(short_bench):
         recorder.suspend()
         time.sleep(3.0)
         recorder.resume()
-        assert rig.finish() == 0, rig.output + rig.logs()
+        rig.finish(0)
         log = open_log(rig.run_dir / "run.mcap")
         cycles = while_armed(log, log["cycle"])
         # The ticks of the stall ran, though their records may be missing in the log; a publisher that waits would have stood
@@ -170,17 +175,18 @@ def test_the_same_over_slcan_and_a_socket_with_no_code_that_knows(tmp_path):
     text = bench_on("slcan", tmp_path) + f'[plant]\nserial = "listen://127.0.0.1:{port}"\n'
     text += f'[inclinometer]\nport = "socket://127.0.0.1:{port}"\n'
     with running(text, name="slcan") as rig:
-        assert rig.finish() == 0, rig.output + rig.logs()
+        rig.finish(0)
         log = open_log(rig.run_dir / "run.mcap")
         assert truth_errors(log).figures()["max_deg"] < 15.0
         assert {f"{arbitration_id:x}" for _, arbitration_id in log.can} == {"80", "90", "100"}
 
 
+@pytest.mark.long
 def test_two_benches_on_one_name_are_refused(short_bench):
     with running(short_bench, name="twice") as first:
         first.wait_for_word(ARMED)
         with running(short_bench, name="twice", runtime=first.folder) as second:
-            assert second.finish() == 3
+            second.finish(3)
             assert len(second.output.splitlines()) == 1
             assert "running already" in second.output
         first.signal(signal.SIGINT)
@@ -193,7 +199,7 @@ def test_an_address_in_use_is_one_line(short_bench):
         holder.listen()
         text = short_bench + f'[zenoh]\nendpoint = "tcp/127.0.0.1:{holder.getsockname()[1]}"\n'
         with running(text, name="in-use") as rig:
-            assert rig.finish() == 3
+            rig.finish(3)
             assert "in use" in rig.output.splitlines()[-1]
 
 
@@ -207,16 +213,11 @@ def test_a_can_channel_nobody_answers_on_is_said_and_nothing_arms(short_bench):
         assert truth["charge_coil_ma"].max() < 1.0
 
 
-def test_the_monitor_is_silent_on_a_good_run_and_can_fault_the_gate(short_bench):
+def test_the_monitor_can_fault_the_gate(short_bench):
     source = constant("Event", "SOURCE_MONITOR")
-    with running(short_bench.replace("[controller]", "[monitor]\nfaults_gate = true\n[controller]"), name="watched") as rig:
-        assert rig.finish() == 0, rig.output + rig.logs()
-        log = open_log(rig.run_dir / "run.mcap")
-        assert source in log["status"]["process"]
-        assert source not in log["event"]["source"]
     strict = "[monitor]\nfaults_gate = true\nerror_max_deg = 0.001\nerror_s = 0.01\n[controller]"
     with running(short_bench.replace("[controller]", strict), name="strict") as rig:
-        assert rig.finish() == 1
+        rig.finish(1)
         assert "the gate went to FAULT: invariant" in rig.output
         log = open_log(rig.run_dir / "run.mcap")
         events = log["event"][log["event"]["source"] == source]

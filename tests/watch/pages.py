@@ -95,9 +95,10 @@ class ToyRig:
     def _obey(self, request):
         action = ACTIONS[request.action]
         self.requests.append((action, time.monotonic()))
-        if (request.origin, request.seq) not in self.used:
-            self.used.add((request.origin, request.seq))
-            if self.gate != STATES[action]:
+        if (action, request.origin, request.seq) not in self.used:
+            self.used.add((action, request.origin, request.seq))  # each channel is counted by itself
+            latched = self.gate == STATES["stop"] and action == "disarm"
+            if self.gate != STATES[action] and not latched:
                 self.gate = STATES[action]
                 self.speaker.say("event", stamp_ns=time.monotonic_ns(), source=1, kind=1, code=self.gate, reason=12)
 

@@ -175,6 +175,7 @@ class Gate:
         (Gate(2), "arm", False, 1),  # one press is one re-arm
         (Gate(2, 1), "arm", True, 1),
         (Gate(1, 0), "disarm", True, 1),
+        (Gate(2), "disarm", False, 1),  # asked on, it would take back the next re-arm
     ],
 )
 def test_asking_the_gate(gate, action, obeyed, asked):

@@ -87,7 +87,7 @@ def share(inside):
     return sum(good for _, good in inside) / len(inside)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(WORLDS)
 def test_the_true_offset_is_inside_the_stated_uncertainty(world):
     _, inside, _ = run(world)

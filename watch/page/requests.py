@@ -57,7 +57,8 @@ class Requester:
 async def ask(send: Callable[[str], None], gate: Callable[[], tuple[int | None, float]], action: str) -> bool:
     """Ask until the gate, heard after the first request, is where `action` leads; False when it is not after `ANSWER_S`.
 
-    `gate()` is its state and when it was heard, s. A gate in FAULT is asked to arm once only: one press is one re-arm.
+    `gate()` is its state and when it was heard, s. A gate in FAULT is asked once only: one press is one re-arm,
+    and a disarm that goes on would take the next one back.
     """
     began_s = time.monotonic()
     sent_s, sends = 0.0, 0
@@ -66,7 +67,7 @@ async def ask(send: Callable[[str], None], gate: Callable[[], tuple[int | None, 
         if sends and heard_s > began_s + STOP_REPEAT_S and state == WANTED[action]:
             return True
         if time.monotonic() - sent_s >= REPEAT_S:
-            if sends and action == "arm" and state == FAULT:
+            if sends and action != "stop" and state == FAULT:
                 return False
             send(action)
             sends, sent_s = sends + 1, time.monotonic()
