@@ -7,8 +7,18 @@ import pytest
 from tests.net.__main__ import finite
 from tests.net.figures import Cell, failures
 
-GOOD = {"gate_faults": 0, "gate_fault_reasons": "", "silent_channels": "", "tick_late_p99_us": 300.0, "ticks": 2000, "ticks_skipped": 0,
-        "truth_error_max_deg": 1.0, "off_ms": None, "pressure_age_p50_ms": 4.0, "inclination_age_p50_ms": 3.0}  # fmt: skip
+GOOD = {
+    "gate_faults": 0,
+    "gate_fault_reasons": "",
+    "silent_channels": "",
+    "tick_late_p99_us": 300.0,
+    "ticks": 2000,
+    "ticks_skipped": 0,
+    "truth_error_max_deg": 1.0,
+    "off_ms": None,
+    "pressure_age_p50_ms": 4.0,
+    "inclination_age_p50_ms": 3.0,
+}
 
 
 def cell(loss=0.0, codes=0, delay_ms=1.0, clocks=("board", "logger"), inside=1.0, **figures):
