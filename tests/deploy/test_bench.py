@@ -163,10 +163,8 @@ def test_shipped_benches_load_and_every_process_has_its_config(name, tmp_path):
 
 
 def test_processes_are_those_whose_tables_stand_in_the_file():
-    assert {p.name for p in processes_of(load_bench(shipped_benches()["sim"]))} == {p.name for p in PROCESSES} - {
-        "monitor",
-        "shadow",
-    }
+    everything = {p.name for p in PROCESSES} - {"monitor", "shadow"}
+    assert {p.name for p in processes_of(load_bench(shipped_benches()["sim"]))} == everything
     real = load_bench(shipped_benches()["real"])
     assert {p.name for p in processes_of(real)} == everything - {"plant"}
     with pytest.raises(BadConfig, match="bench 'real' has no process 'plant'; it has: recorder, valves, "):
