@@ -186,8 +186,7 @@ def test_shipped_benches_load_and_every_process_has_its_config(name, tmp_path):
 
 
 def test_processes_are_those_whose_tables_stand_in_the_file():
-    asked_for = {"monitor", "shadow"}
-    everything = {p.name for p in PROCESSES} - asked_for
+    everything = {p.name for p in PROCESSES} - {"monitor", "shadow"}
     assert {p.name for p in processes_of(load_bench(shipped_benches()["sim"]))} == everything
     real = load_bench(shipped_benches()["real"])
     assert {p.name for p in processes_of(real)} == everything - {"plant"}

@@ -34,7 +34,7 @@ def test_one_identity_for_each_process_and_person(file, tmp_path):
     said = make(file)
     everybody = keys.identities_of(load_bench(file))
     assert set(everybody) == {
-        "router", "launcher", "plant", "valves", "pressures", "inclinometer", "controller", "recorder", "monitor", "shadow",
+        "router", "launcher", "plant", "valves", "pressures", "inclinometer", "controller", "recorder", "monitor",
         "operator", "guest",
     }  # fmt: skip
     assert all(name in said for name in everybody)
