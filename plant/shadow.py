@@ -43,7 +43,7 @@ class Window:
         self._held: deque[tuple[int, float]] = deque()
 
     def add(self, stamp_ns: int, residual: float) -> None:
-        self._held.append((stamp_ns, residual))
+        self._held.append((stamp_ns, float(residual)))
 
     def look(self, now_ns: int) -> tuple[float, float]:
         """(newest, RMS) at `now_ns`; NaN where nothing came within the window."""
