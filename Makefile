@@ -44,10 +44,10 @@ demo: $(STAMP)
 	$(BIN)/softloop run sim
 	$(BIN)/softloop run sim_t2
 
-# Two at a time, by file; those of a whole rig come last and one at a time: they need the machine for themselves.
+# Three at a time, by file, for many wait for processes; those of a whole rig come last and one at a time: they need the machine for themselves.
 test: $(STAMP)
 	$(BIN)/softloop warm
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not rig and not exact and not page and not commands and not long and not rerun and not net'
+	$(BIN)/python -m pytest -n 3 --dist loadfile -m 'not rig and not exact and not page and not commands and not long and not rerun and not net'
 	$(BIN)/python -m pytest -m 'rig and not page and not long'
 
 # The live page in Debian's chromium, a whole rig behind it in the last tests; other browsers by CHROMIUM=PATH.

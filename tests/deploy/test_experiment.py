@@ -135,6 +135,7 @@ def test_from_the_experiment_to_a_run_on_what_was_identified(tmp_path):
     assert "own" in (tmp_path / "t" / "arc_t1" / "parameters.toml").read_text()
 
 
+@pytest.mark.long
 def test_over_many_rigs_the_bar_decides_the_exit_code(tmp_path):
     done = softloop("experiment", "pressure", "sim", "--over", "100:101", "--json", cwd=tmp_path)
     runs = json.loads(done.stdout)["runs"]
@@ -144,6 +145,7 @@ def test_over_many_rigs_the_bar_decides_the_exit_code(tmp_path):
     assert (done.returncode, "no table [plant]" in done.stderr) == (2, True)
 
 
+@pytest.mark.long
 def test_a_limit_that_is_passed_ends_the_experiment_with_exit_code_1(tmp_path):
     bench_with(tmp_path, "[valves]\nangle_max_deg = 90.0\n")
     done = softloop("experiment", "pressure", "bench.toml", "--pace", "batch", "--out", "p", cwd=tmp_path)

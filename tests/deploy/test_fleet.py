@@ -144,7 +144,7 @@ def wait_until(condition, *hosts, timeout_s=60.0):
     ("mode", "order"),
     [
         ("peer", ("desk", "log", "bench")),
-        ("client", ("bench", "log", "desk")),
+        pytest.param("client", ("bench", "log", "desk"), marks=pytest.mark.long),
         pytest.param("peer", ("bench", "log", "desk"), marks=pytest.mark.long),
         pytest.param("client", ("desk", "log", "bench"), marks=pytest.mark.long),
     ],
@@ -204,6 +204,7 @@ def test_an_interrupt_on_one_host_disarms_and_ends_all(start):
     assert hosts[1].outcome.text.startswith("host 'log' was interrupted")
 
 
+@pytest.mark.long
 def test_another_bench_file_is_refused(start):
     other = BENCH.replace("[valves]", "[valves]\nhold_ticks = 4")
     hosts = [start("bench", text=other), start("desk"), start("log")]
@@ -213,6 +214,7 @@ def test_another_bench_file_is_refused(start):
     assert "has another bench file, or another version of softloop" in "\n".join(h.outcome.text for h in hosts)
 
 
+@pytest.mark.long
 def test_a_clock_that_is_not_sure_enough_arms_nothing(start):
     strict = BENCH.replace("uncertainty_max_ms = 500.0", "uncertainty_max_ms = 0.001")
     hosts = [start(name, text=strict, wait_s=14.0) for name in ("bench", "desk", "log")]

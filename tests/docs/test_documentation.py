@@ -68,6 +68,7 @@ def tutorial_commands():
             yield pytest.param(command, id=f"{name} {' '.join(command)}")
 
 
+@pytest.mark.commands
 @pytest.mark.parametrize("command", list(tutorial_commands()))
 def test_a_command_without_a_rig_does_what_the_page_says(command, runs):
     words = [str(runs / STANDS_FOR[word]) if word in STANDS_FOR else word for word in command]

@@ -100,6 +100,7 @@ def test_closing_the_work_half_way_leaves_no_process(tables):
     assert not [name for name in names if "forkserver" in name and "from multiprocessing.spawn" in name]
 
 
+@pytest.mark.long
 def test_two_dask_workers_give_the_results_of_this_process(tables, results):
     distributed = pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
     cluster = distributed.LocalCluster(
