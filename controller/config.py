@@ -146,7 +146,7 @@ class ControllerConfig(ProcessTable):
         100.0,
         ge=0,
         le=200,
-        description="adaptation is frozen while new samples of a sensor come less often; half of both devices' rate",
+        description="nothing is adapted while a sensor's new samples come less often; half of both devices' rate",
     )
     actuation: ActuationConfig = ActuationConfig()
     pid: PidConfig = PidConfig()
