@@ -142,6 +142,12 @@ class ControllerConfig(ProcessTable):
     inclination_delay_ms: float = Field(1.0, ge=0, le=100, description="declared lag of the inclinometer before its stamp")
     pressure_budget_ms: float = Field(20.0, gt=0, description="an older pressure is not valid")
     inclination_budget_ms: float = Field(30.0, gt=0, description="an older inclination is not valid")
+    input_rate_min_hz: float = Field(
+        100.0,
+        ge=0,
+        le=200,
+        description="nothing is adapted while a sensor's new samples come less often; half of both devices' rate",
+    )
     actuation: ActuationConfig = ActuationConfig()
     pid: PidConfig = PidConfig()
     smc: SmcConfig = SmcConfig()

@@ -20,8 +20,10 @@ from softloop.controller.records import (
     IN_APPROACH_START,
     IN_CHARGE_BEFORE_MA,
     IN_EXHAUST_BEFORE_MA,
+    IN_INCLINATION_RATE_HZ,
     IN_INTEGRAL_KPA,
     IN_MODE_TICKS,
+    IN_PRESSURE_RATE_HZ,
     N_FLOWS,
     OBSERVER_TYPE,
     PHASE_APPROACH,
@@ -39,6 +41,9 @@ _F8 = types.f8
 def recall_course(config: Any, knots: np.ndarray, table: np.ndarray, cycle: Any, state: Any, scratch: Any) -> None:
     """Set in `state` what belongs to the course of the run and to no law: counts, phase, its start, the approach."""
     state.seq, state.skipped_total, state.last_ns = cycle.seq, cycle.skipped_total, cycle.stamp_ns
+    state.pressure_seq, state.inclination_seq = cycle.pressure_seq, cycle.inclination_seq
+    state.pressure_rate_hz = cycle.internal[IN_PRESSURE_RATE_HZ]
+    state.inclination_rate_hz = cycle.internal[IN_INCLINATION_RATE_HZ]
     state.phase = cycle.phase
     on_plan = cycle.phase == PHASE_TRACK or cycle.phase == PHASE_DONE
     state.phase_start_ns = cycle.stamp_ns - cycle.trajectory_ns - (0 if on_plan else config.approach_ns)

@@ -41,6 +41,7 @@ CYCLE = message("CycleRecord").dtype
 # state after the tick (`recall` reads it back).
 IN_CHAMBER_KPA, IN_SUPPLY_KPA, IN_PERIOD_S, IN_INTEGRAL_KPA, IN_MODE_TICKS = 0, 1, 2, 3, 4
 IN_APPROACH_START, IN_CHARGE_BEFORE_MA, IN_EXHAUST_BEFORE_MA = 5, 6, 7
+IN_PRESSURE_RATE_HZ, IN_INCLINATION_RATE_HZ = 8, 9
 # Places of `CycleRecord.estimator`: the observer's scalars in the order of `OBSERVER_SCALARS`, how long before the tick it stands
 # (ns, inclination and pressure), and from EST_FLOWS on its flows, newest first.
 N_FLOWS = 32  # ticks of commands under way: 160 ms of delay and age together
@@ -187,6 +188,10 @@ CONTROLLER_STATE = record_dtype(
         ("charge_before_ma", "f8"),
         ("exhaust_before_ma", "f8"),
         ("mode_ticks", "i8"),
+        ("pressure_seq", "i8"),  # the samples of the tick before, and how often a tick found a newer one, 1/s
+        ("inclination_seq", "i8"),
+        ("pressure_rate_hz", "f8"),
+        ("inclination_rate_hz", "f8"),
         ("pid", PID_STATE),
         ("arc", ARC_STATE),
         ("observer", OBSERVER_STATE),  # before the bytes: nested records must stay aligned
@@ -210,6 +215,7 @@ CONFIG = record_dtype(
         ("inclination_delay_ns", "i8"),
         ("actuation_delay_ns", "i8"),  # from tick to valve opening
         ("rest_deg_s", "f8"),  # the approach begins at no higher rate
+        ("input_rate_min_hz", "f8"),  # below it nothing is adapted
         ("predict", "u1"),
         ("observe", "u1"),  # the law is given the observer's state
     ]

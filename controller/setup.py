@@ -118,6 +118,7 @@ def build(config: ControllerConfig, parameters: Parameters | None = None) -> Con
     state = np.zeros(1, CONTROLLER_STATE)
     state[0].theta[:] = model.theta
     state[0].mode = MODE_HOLD
+    state[0].pressure_rate_hz = state[0].inclination_rate_hz = 1e9 / PERIOD_NS  # believed until ticks have shown otherwise
     return Controller(
         config=_array_of_one(config_record(config, plan)),
         model=_array_of_one(model),
@@ -147,6 +148,7 @@ def config_record(config: ControllerConfig, plan: Plan) -> Any:
     record.plan_kind, record.plan_ns = plan.kind, plan.duration_ns
     record.pressure_budget_ns = round(config.pressure_budget_ms * MS)
     record.inclination_budget_ns = round(config.inclination_budget_ms * MS)
+    record.input_rate_min_hz = config.input_rate_min_hz
     record.pressure_delay_ns = round(config.pressure_delay_ms * MS)
     record.inclination_delay_ns = round(config.inclination_delay_ms * MS)
     record.actuation_delay_ns = round(config.actuation_delay_ms * MS)

@@ -30,9 +30,11 @@ from softloop.controller.records import (
     IN_CHAMBER_KPA,
     IN_CHARGE_BEFORE_MA,
     IN_EXHAUST_BEFORE_MA,
+    IN_INCLINATION_RATE_HZ,
     IN_INTEGRAL_KPA,
     IN_MODE_TICKS,
     IN_PERIOD_S,
+    IN_PRESSURE_RATE_HZ,
     IN_SUPPLY_KPA,
     INPUTS_TYPE,
     LAW_ARC,
@@ -80,6 +82,27 @@ def inputs_valid(config: Any, inputs: Any) -> bool:
     numbers = inputs.pressure.supply_pressure_kpa + inputs.pressure.chamber_pressure_kpa
     numbers += inputs.inclination.angle_deg + inputs.inclination.rate_deg_s
     return bool(inputs.pressure.status == SAMPLE_OK and np.isfinite(numbers))
+
+
+RATE_WINDOW_S = 0.5  # long beside the jitter of a free-running sensor, short beside the parameters' own pace
+
+
+@kernel(_F8(_F8, types.b1, _F8))
+def rate_after(rate_hz: float, fresh: bool, elapsed_s: float) -> float:
+    """A running mean over `RATE_WINDOW_S` of how often a tick finds a new sample, 1/s, after one more tick."""
+    now_hz = 1.0 / elapsed_s if fresh else 0.0
+    return float(rate_hz + (now_hz - rate_hz) * elapsed_s / (RATE_WINDOW_S + elapsed_s))
+
+
+@kernel(types.b1(CONFIG_TYPE, INPUTS_TYPE, STATE_TYPE))
+def inputs_often_enough(config: Any, inputs: Any, state: Any) -> bool:
+    """Count the new samples of this tick; whether both sensors still bring them at the declared rate."""
+    elapsed_ns = inputs.now_ns - state.last_ns
+    elapsed_s = 1e-9 * (elapsed_ns if state.last_ns != 0 and elapsed_ns > 0 else config.period_ns)
+    state.pressure_rate_hz = rate_after(state.pressure_rate_hz, inputs.pressure.seq != state.pressure_seq, elapsed_s)
+    state.inclination_rate_hz = rate_after(state.inclination_rate_hz, inputs.inclination.seq != state.inclination_seq, elapsed_s)
+    state.pressure_seq, state.inclination_seq = inputs.pressure.seq, inputs.inclination.seq
+    return bool(min(state.pressure_rate_hz, state.inclination_rate_hz) >= config.input_rate_min_hz)
 
 
 @kernel(types.void(_F8, REFERENCE_TYPE, _F8, THETA_TYPE))
@@ -270,6 +293,8 @@ def record_thoughts(config: Any, measurement: Any, reference: Any, demand: Any, 
     cycle.internal[IN_PERIOD_S] = measurement.period_s
     cycle.internal[IN_INTEGRAL_KPA], cycle.internal[IN_MODE_TICKS] = state.pid.integral_kpa, state.mode_ticks
     cycle.internal[IN_APPROACH_START] = state.approach[0]
+    cycle.internal[IN_PRESSURE_RATE_HZ] = state.pressure_rate_hz
+    cycle.internal[IN_INCLINATION_RATE_HZ] = state.inclination_rate_hz
     cycle.internal[IN_CHARGE_BEFORE_MA], cycle.internal[IN_EXHAUST_BEFORE_MA] = state.charge_before_ma, state.exhaust_before_ma
     record_observer(state.observer, cycle)
     cycle.observing, cycle.trusted = config.observe, measurement.trust >= 1.0
@@ -301,6 +326,7 @@ def controller_tick(
     """
     measurement, reference, demand = scratch.measurement, scratch.reference, scratch.demand
     valid = inputs_valid(config, inputs)
+    often_enough = inputs_often_enough(config, inputs, state)
     follow_phase(config, model, inputs, knots, table, state, scratch)
     active = state.phase == PHASE_APPROACH or state.phase == PHASE_TRACK
     if config.observe and active:
@@ -308,7 +334,7 @@ def controller_tick(
         observe(config, model, gains, inputs, state, measurement)
     else:
         measure(config, model, inputs, state, measurement)
-    measurement.adapt = valid and state.saturated == 0 and state.phase != PHASE_WAIT
+    measurement.adapt = valid and often_enough and state.saturated == 0 and state.phase != PHASE_WAIT
     acts_ns = inputs.now_ns + (config.actuation_delay_ns if config.predict else 0)
     reference_now(config, knots, table, state, acts_ns, reference)
     if active:

@@ -17,7 +17,13 @@ MS = 1_000_000
 TRAJECTORIES = {"pressure": "excitation_1hz", "pressure_eso": "excitation_1hz", "valve_test": "valve_steps"}
 
 
-def fed(controller, tick, armed=True, angle=26.75, pressure=0.5, age_ns=3 * MS, status=0, rate=0.0):
+def fed(controller, tick, **given):
+    """The cycle record of a tick on inputs made of what is `given`."""
+    prepare(controller, tick, **given)
+    return controller.tick()
+
+
+def prepare(controller, tick, armed=True, angle=26.75, pressure=0.5, age_ns=3 * MS, status=0, rate=0.0):
     inputs = controller.inputs[0]
     inputs.now_ns, inputs.tick, inputs.skipped = 10**9 + tick * PERIOD_NS, tick, 0
     inputs.pressure.seq = inputs.inclination.seq = inputs.valves.seq = tick + 1
@@ -26,7 +32,6 @@ def fed(controller, tick, armed=True, angle=26.75, pressure=0.5, age_ns=3 * MS, 
     inputs.pressure.status = status
     inputs.inclination.angle_deg, inputs.inclination.rate_deg_s = angle, rate
     inputs.valves.gate = r.GATE_ARMED if armed else 0
-    return controller.tick()
 
 
 def built(law):
@@ -119,6 +124,36 @@ def test_stale_inputs_are_said_and_stop_adaptation(controller, what):
     assert not cycle.adapting
 
 
+@pytest.mark.parametrize("what", ["pressure", "inclination"])
+def test_a_sensor_that_slows_down_stops_adaptation_until_it_is_back(what):
+    controller = built("arc")
+    controller.config[0].plan_ns = 10**12
+    place = r.IN_PRESSURE_RATE_HZ if what == "pressure" else r.IN_INCLINATION_RATE_HZ
+
+    def run(ticks, every):
+        adapted = []
+        for k in ticks:
+            before = controller.inputs[0][what].copy()
+            prepare(controller, k, angle=60.0, pressure=50.0)
+            if k % every:
+                controller.inputs[0][what] = before  # the last sample still lies there, older than before
+            cycle = controller.tick()
+            assert cycle.inputs_valid
+            adapted.append(bool(cycle.adapting))
+        return adapted, cycle.internal[place]
+
+    _, rate_hz = run(range(300), 1)
+    assert rate_hz == 200.0
+    adapted, rate_hz = run(range(300, 600), 3)
+    assert rate_hz == pytest.approx(200.0 / 3, rel=0.05)
+    assert not any(adapted[150:])
+    adapted, rate_hz = run(range(600, 900), 1)
+    assert rate_hz > 150.0
+    assert any(adapted[150:])
+    controller.config[0].input_rate_min_hz = 50.0
+    assert any(run(range(900, 1200), 3)[0][150:])
+
+
 def test_one_valve_works_at_a_time_and_currents_stay_in_range(controller):
     rng = np.random.RandomState(2)
     for k in range(400):
@@ -137,7 +172,9 @@ def test_equal_inputs_give_equal_bytes(steps):
     runs = []
     for _ in range(2):
         one = build_cached()
-        runs.append(b"".join(fed(one, k, armed, angle, p).tobytes() for k, (angle, p, armed) in enumerate(steps)))
+        runs.append(
+            b"".join(fed(one, k, armed=armed, angle=angle, pressure=p).tobytes() for k, (angle, p, armed) in enumerate(steps))
+        )
     assert runs[0] == runs[1]
 
 
