@@ -39,10 +39,14 @@ $(STAMP): requirements.lock pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch $@
 
+# On a machine that stands still for longer than the gate waits a run ends in a FAULT, as it must (exit code 1): then once more.
 demo: $(STAMP)
 	$(BIN)/softloop warm
-	$(BIN)/softloop run sim
-	$(BIN)/softloop run sim_t2
+	@for bench in sim sim_t2; do for try in 1 2 3; do \
+		code=0; $(BIN)/softloop run $$bench || code=$$?; \
+		test $$code -eq 1 -a $$try -lt 3 || break; \
+		echo "make: try $$try of 3 of $$bench did not reach its end; again" >&2; \
+	done; test $$code -eq 0 || exit $$code; done
 
 # Three at a time, by file, for many wait for processes; those of a whole rig come last and one at a time: they need the machine for themselves.
 test: $(STAMP)

@@ -134,7 +134,7 @@ def test_a_sensor_that_slows_down_stops_adaptation_until_it_is_back(what):
         adapted = []
         for k in ticks:
             before = controller.inputs[0][what].copy()
-            prepare(controller, k, angle=60.0, pressure=50.0)
+            prepare(controller, k, angle=controller.cycle[0].reference_deg, pressure=controller.cycle[0].desired_pressure_kpa)
             if k % every:
                 controller.inputs[0][what] = before  # the last sample still lies there, older than before
             cycle = controller.tick()
@@ -142,8 +142,9 @@ def test_a_sensor_that_slows_down_stops_adaptation_until_it_is_back(what):
             adapted.append(bool(cycle.adapting))
         return adapted, cycle.internal[place]
 
-    _, rate_hz = run(range(300), 1)
+    adapted, rate_hz = run(range(300), 1)
     assert rate_hz == 200.0
+    assert any(adapted[150:])
     adapted, rate_hz = run(range(300, 1200), 3)
     assert rate_hz == pytest.approx(200.0 / 3, rel=0.05)
     assert not any(adapted[150:])
