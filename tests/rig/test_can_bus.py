@@ -102,6 +102,7 @@ def babble(stop, endpoint, name):
 
 
 @pytest.mark.rig
+@pytest.mark.long
 def test_a_guest_fills_the_bus_and_waits_for_all_others_and_a_gate_that_is_driven_off_it_vents(tmp_path):
     (tmp_path / "wide.toml").write_text(f'base = "{SIM_CAN}"\n{WIDE}')
     disturb = '[[faults.injections]]\nkind = "bus_disturb"\ntarget = "command"\nat_s = 4.0\nduration_s = 0.05\n'

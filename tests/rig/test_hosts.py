@@ -39,7 +39,8 @@ def assert_clean(rigs):
 @pytest.mark.rig
 @pytest.mark.skipif(not own_clocks_permitted(), reason="needs the right to make a time namespace (root)")
 def test_four_hosts_with_clocks_of_their_own_track_as_one(tmp_path):
-    with fleet(text_of(tmp_path, "clocks", mode="peer")) as rigs:
+    text = text_of(tmp_path, "clocks", mode="peer").replace("[run]\n", "[run]\nreport = true\n", 1)
+    with fleet(text) as rigs:
         for name in ("log", "devices", "rig", "desk"):
             rigs.start(name, AHEAD_S[name], report=name == "log")
         assert rigs.finish() == dict.fromkeys(HOSTS, 0), rigs.report()

@@ -9,7 +9,6 @@ from tests.deploy.wt931_on_a_pty import Wt931
 from tests.rig.rigs import running
 from tests.rig.test_whole_rig import WIDE
 
-pytestmark = pytest.mark.rig
 ANGLE_DEG = 33.0
 
 
@@ -19,6 +18,8 @@ def test_the_shipped_mixed_rig_has_a_real_inclinometer_and_nothing_else_real():
     assert bench.inclinometer.port.startswith("/dev/")
 
 
+@pytest.mark.rig
+@pytest.mark.long
 def test_a_mixed_rig_runs_and_its_angle_is_the_real_devices(tmp_path):
     (tmp_path / "wide.toml").write_text(f'base = "{shipped_benches()["mixed"]}"\n{WIDE}')
     imu = Wt931(tmp_path / "imu", rate_hz=200, baud=115_200)

@@ -115,10 +115,10 @@ def test_a_killed_launcher_takes_all_with_it_and_the_gate_vents_first(short_benc
         assert last["charge_current_ma"] == 0.0
 
 
-LESS_OFTEN = [pytest.param(victim, marks=pytest.mark.long) for victim in ("pressures", "inclinometer")]
+LESS_OFTEN = [pytest.param(victim, marks=pytest.mark.long) for victim in ("valves", "pressures", "inclinometer")]
 
 
-@pytest.mark.parametrize("victim", ["controller", "valves", *LESS_OFTEN])
+@pytest.mark.parametrize("victim", ["controller", *LESS_OFTEN])
 def test_a_killed_process_of_the_control_path_ends_in_a_vent_and_is_named(short_bench, victim):
     with running(short_bench, name="lost") as rig:
         rig.wait_for_word(ARMED)
