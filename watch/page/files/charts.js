@@ -108,19 +108,20 @@ export class Charts {
     fit();
   }
 
-  draw(seconds, to) {
+  // What draws the `seconds` before `to`, a function for each chart.
+  parts(seconds, to) {
     const view = this.store.view(seconds, to);
-    for (const chart of this.all) chart.draw(view, to - seconds, to);
+    return this.all.map((chart) => () => chart.draw(view, to - seconds, to));
   }
 }
 
 // Bars over a logarithmic axis of lateness; the counts logarithmic too, because what matters is the rare late tick.
 export function drawHistogram(canvas, counts, edges) {
   const scale = window.devicePixelRatio || 1, width = canvas.clientWidth, height = 110;
-  canvas.width = Math.round(width * scale);
-  canvas.height = Math.round(height * scale);
+  const size = [Math.round(width * scale), Math.round(height * scale)];
+  if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size; // costs a new picture each time
   const c = canvas.getContext("2d");
-  c.scale(scale, scale);
+  c.setTransform(scale, 0, 0, scale, 0, 0);
   c.clearRect(0, 0, width, height);
   const base = height - 18, top = Math.log10(1 + Math.max(10, ...counts)), bar = width / counts.length;
   counts.forEach((count, i) => {

@@ -1,14 +1,14 @@
-// The page: its connection, its buttons, and the frame that draws what came.
+// The page: its connection, its buttons, and the picture of what came.
 import { Charts } from "./charts.js";
+import { Frames } from "./frames.js";
 import { Panels, make, showLaw } from "./panels.js";
 import { Store } from "./store.js";
 
 const $ = (id) => document.getElementById(id);
-const FRAME_MS = 1000 / 30;
 const SILENT_MS = 2000; // the server speaks ten times a second, whatever the rig does
 const WINDOWS = [["10 s", 10], ["30 s", 30], ["2 min", 120], ["10 min", 600]];
 
-const page = { store: null, charts: null, panels: null, hello: null, state: null, events: [], fps: 0, frames: 0, drawMs: 0, spent: 0, seconds: 30, paused: null, heard: 0, socket: null };
+const page = { store: null, charts: null, panels: null, hello: null, state: null, events: [], frames: null, seconds: 30, paused: null, heard: 0, socket: null };
 window.softloop = page; // for a person with a console, and for tests
 
 // ---- the connection: comes back by itself
@@ -258,36 +258,23 @@ document.addEventListener("keydown", (event) => {
 // The newest time that came.
 function now() { return Math.max(0, page.store.last); }
 
-let drawnAt = 0, drawMs = 0, countedAt = performance.now();
-
-function frame(at) {
-  requestAnimationFrame(frame);
-  if (at - drawnAt < Math.max(FRAME_MS - 4, 3 * drawMs)) return; // on a slow machine the buttons come before the curves
-  drawnAt = at;
-  if (page.charts && page.store.count) {
-    const to = page.paused ?? now(), began = performance.now();
-    page.charts.draw(page.seconds, to);
-    drawMs = performance.now() - began;
-    page.spent += drawMs;
-    $("clock").textContent = `${page.paused === null ? "" : "paused at "}${to.toFixed(2)} s`;
-  }
-  page.frames++;
-  if (at - countedAt > 1000) {
-    page.fps = (page.frames * 1000) / (at - countedAt);
-    page.drawMs = page.spent / page.frames;
-    page.frames = page.spent = 0;
-    countedAt = at;
-    footer();
-  }
+function picture() {
+  if (!page.charts || !page.store.count) return [];
+  const to = page.paused ?? now();
+  const clock = () => { $("clock").textContent = `${page.paused === null ? "" : "paused at "}${to.toFixed(2)} s`; };
+  return [clock, ...page.charts.parts(page.seconds, to)];
 }
 
 function footer() {
+  frames.count();
   const state = page.state, viewers = state?.viewers ?? 0;
-  $("footer").textContent = `${page.fps.toFixed(0)} frames a second, ${viewers} viewer${viewers === 1 ? "" : "s"}`;
+  $("footer").textContent = `${frames.fps.toFixed(0)} pictures a second, ${viewers} viewer${viewers === 1 ? "" : "s"}`;
 }
+
+const frames = (page.frames = new Frames(picture));
 
 show("connecting");
 connect();
+setInterval(footer, 1000);
 setInterval(watch, 250);
 setInterval(() => { if (page.panels && page.dirty) { page.dirty = 0; page.panels.state(page.state); } }, 100);
-requestAnimationFrame(frame);
