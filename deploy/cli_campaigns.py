@@ -80,13 +80,14 @@ def evaluate(
     laws: Annotated[str, typer.Option(metavar="LAW,LAW", help="Default: all.")] = "",
     only: Annotated[str, typer.Option(metavar="CONDITION", help='One condition, such as "own latency"; default: all.')] = "",
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Draw Figs. 6 and 7 of all laws there.")] = None,
-    confirm: Annotated[int, typer.Option(metavar="N", min=0, help="Run the first N rigs at wall pace too, all processes.")] = 0,
+    confirm: Annotated[int, typer.Option(metavar="N", min=0, help="Run the first N rigs over the whole stack too.")] = 0,
+    pace: Annotated[Literal["wall", "lockstep"], typer.Option(help="Of the runs that confirm, all processes.")] = "wall",
     as_json: Annotated[bool, typer.Option("--json", help="Everything as JSON, every rig.")] = False,
 ) -> int:
     """Judge every law with its tuned gains on many simulated rigs; exit code 1 where arc_eso misses a bar of its own."""
     from softloop.deploy.evaluate import run_evaluate
 
-    return run_evaluate(seeds, laws, only, figures, confirm, as_json=as_json)
+    return run_evaluate(seeds, laws, only, figures, confirm, pace, as_json=as_json)
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""`softloop evaluate`: the comparison of laws with its progress, its tables, its pictures, and its runs at wall pace."""
+"""`softloop evaluate`: the comparison of laws with its progress, its tables, its pictures, and its runs over the whole stack."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from softloop.deploy.confirm import confirm_runs, wall_table
+from softloop.deploy.confirm import Pace, confirm_runs, confirmed_table
 from softloop.deploy.tune import seeds_of
 from softloop.offline.closed_loop import simulate_run
 from softloop.offline.comparison_figures import save, side_by_side
@@ -48,7 +48,7 @@ _KEPT = {"bars": "bars_kept", "load": "payload_kept", "quiet": "quiet", "paper":
 _SHARE_OF_RIGS = 0.9  # of the rigs on which the bars must hold: 18 of 20
 
 
-def run_evaluate(seeds: str, laws: str, only: str, figures_dir: Path | None, confirm: int, *, as_json: bool) -> int:
+def run_evaluate(seeds: str, laws: str, only: str, figures_dir: Path | None, confirm: int, pace: Pace, *, as_json: bool) -> int:
     """Evaluate, show; exit code 1 where `arc_eso` at the rig's own latency misses a bar. Raises BadFile or BadConfig."""
     rigs, chosen = seeds_of(seeds), _laws(laws)
     conditions = [c for c in CONDITIONS if only in ("", c.name)]
@@ -57,13 +57,13 @@ def run_evaluate(seeds: str, laws: str, only: str, figures_dir: Path | None, con
     with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("evaluating", total=None)
         verdicts = evaluate(chosen, conditions, rigs, lambda done, total: bar.update(task, completed=done, total=total))
-    confirmed = confirm_runs(chosen, rigs[:confirm]) if confirm else []
+    confirmed = confirm_runs(chosen, rigs[:confirm], pace) if confirm else []
     if figures_dir is not None:
         draw(chosen, rigs[0], figures_dir)
     latency = latency_budget(chosen[-1], rigs[0])
     if as_json:
         content = [v.content() for v in verdicts]
-        print(json.dumps({"seeds": seeds, "latency_ms": latency, "verdicts": content, "wall_pace": confirmed}))
+        print(json.dumps({"seeds": seeds, "latency_ms": latency, "verdicts": content, "whole_stack": confirmed}))
     else:
         show(verdicts, latency, confirmed)
     return EXIT_OK if _kept(verdicts) else EXIT_NEGATIVE
@@ -119,7 +119,7 @@ def show(verdicts: Sequence[Verdict], latency: dict[str, float], confirmed: list
     console.print(f"bars, deg: {bars}; back under 0.5 deg in {RECOVERY_S:g} s; {SWITCHES_PER_S:g} switches per second on dwells")
     console.print(f"the paper's ARC, deg: {paper}")
     if confirmed:
-        console.print(wall_table(confirmed))
+        console.print(confirmed_table(confirmed))
 
 
 def _row(verdict: Verdict) -> list[str]:

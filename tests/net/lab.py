@@ -29,6 +29,7 @@ from pyroute2 import IPRoute, NetlinkError, netns
 from tests.net.cable import Way
 
 TUN = "cable0"
+RTO_MIN_MS = 10  # the kernel's own 200 is longer than any budget here: TCP would not try again in time
 INTO_TUN = 100  # the routing table of what comes from a host
 TOOLS = ("nsenter", "setpriv", "unshare")  # util-linux
 NO_SUCH_KIND = 2  # ENOENT: the kernel does not know the queueing discipline
@@ -133,7 +134,7 @@ class Network:
         self.middle.route.link("add", ifname=f"to-{name}", kind="veth", peer=peer)
         self.middle.address(f"to-{name}", f"10.77.{number}.1")
         host.address("eth0", f"10.77.{number}.2")
-        host.route.route("add", dst="0.0.0.0/0", gateway=f"10.77.{number}.1")
+        host.route.route("add", dst="0.0.0.0/0", gateway=f"10.77.{number}.1", metrics={"rto_min": RTO_MIN_MS})
 
     def cable(self, host: str, *, plugged: bool) -> None:
         """Pull a host's cable, or plug it in again: its link has no carrier while it is out."""
