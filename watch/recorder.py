@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import math
 import os
 import time
 from dataclasses import dataclass, field
@@ -48,6 +49,7 @@ _STEADY_HZ = 100.0  # a channel of at least this rate that says nothing for a se
 STATUS_S = 1.0
 _STORE_BYTES = 1 << 20
 _RETRY_S = 0.1
+_BATCH = 4096  # messages written between two looks at what is due to the disk
 _QUIET_PASSES = 3  # nothing came on so many passes: all that was sent has arrived
 
 
@@ -192,6 +194,9 @@ class Recorder:
         self._heard: dict[str, int] = {}
         self._silent: set[str] = set()
         self._refused = False
+        self._retry_s = -math.inf  # until then a disk that refused is left alone
+        self._looked_s = time.monotonic()  # nothing waited then
+        self._oldest_s = math.inf  # since when the chunk in progress may hold messages, or these may have waited before
         self._late_max_ns = 0
         # At lockstep pace its word on itself, which is of this machine and moment, stands in its account alone.
         self._speaks = not context.pace.exact
@@ -200,7 +205,17 @@ class Recorder:
     def take(self) -> int:
         """Write what has arrived; how many messages came."""
         arrived, overrun = self.inbox.take_all()
+        since_s, self._looked_s = self._looked_s, time.monotonic()
         missing_before = self.account.missing
+        for start in range(0, len(arrived), _BATCH):
+            self._oldest_s = min(self._oldest_s, since_s)
+            self._write_all(arrived[start : start + _BATCH])
+            self.keep()
+        if overrun:
+            self.account.backlog += self.account.missing - missing_before
+        return len(arrived)
+
+    def _write_all(self, arrived: list[tuple[str, bytes]]) -> None:
         full = self.sink.waiting > self.config.unwritten_mib << 20
         for full_key, payload in arrived:
             channel = self._channel(full_key)
@@ -212,9 +227,6 @@ class Recorder:
                 self.account.storage += 1
             else:
                 self._write(full_key, channel, payload)
-        if overrun:
-            self.account.backlog += self.account.missing - missing_before
-        return len(arrived)
 
     def _channel(self, full_key: str) -> Channel | None:
         if full_key not in self._channels:
@@ -231,10 +243,24 @@ class Recorder:
         else:
             self.account.note(full_key, len(payload), seq, sender)
 
+    def keep(self) -> None:
+        """Give to the disk what is due: the chunk in progress once it holds what is `flush_s` old, a full one at once.
+
+        Age counts from the look before, at which nothing waited, so that a message's wait for this process is in it.
+        """
+        now_s = time.monotonic()
+        if now_s < self._retry_s:
+            return
+        if now_s - self._oldest_s >= self.config.flush_s:
+            self.flush()
+        elif self.sink.waiting:
+            self.store()
+
     def flush(self) -> None:
-        """Close the chunk and give all to the disk; a disk that refuses is said once, and tried again next time."""
+        """Close the chunk and give all to the disk; a disk that refuses is said once, and tried again soon."""
         if self.sink.waiting <= self.config.unwritten_mib << 20:
             self.log.flush()
+            self._oldest_s = math.inf
         self.store()
 
     def store(self) -> None:
@@ -242,6 +268,7 @@ class Recorder:
         try:
             self.sink.store()
         except OSError as error:
+            self._retry_s = time.monotonic() + _RETRY_S
             if not self._refused:
                 self._refused = True
                 self._storage_lost(error.strerror or str(error))
@@ -309,13 +336,18 @@ class Recorder:
         self.context.stop.wait(self.config.poll_s)
 
     def finish(self) -> None:
-        """Write what is left, within `drain_s`, close the file and leave the account."""
+        """Write what is left, within `drain_s`, close the file and leave the account.
+
+        What was heard goes to the disk first: who has no patience with this process may kill it.
+        """
         end = time.monotonic() + self.config.drain_s
+        self.flush()
         self.report()
         quiet = 0
         while quiet < _QUIET_PASSES and time.monotonic() < end:
             time.sleep(self.config.poll_s)  # what others sent with their last breath is on its way
             quiet = 0 if self.take() else quiet + 1
+            self.keep()
         self.log.finish()
         self.store()
         while self.sink.waiting and time.monotonic() < end:
@@ -341,13 +373,11 @@ def run(config: RecorderConfig, context: Context) -> None:
     """
     recorder = Recorder(config, context)
     context.enter_loop()
-    next_flush_s = next_report_s = time.monotonic()
+    next_report_s = time.monotonic()
     while not context.stop:
         now_s = time.monotonic()
         context.pace.keep_up(recorder.take)
-        if now_s >= next_flush_s:
-            recorder.flush()
-            next_flush_s = now_s + config.flush_s
+        recorder.keep()
         if now_s >= next_report_s:
             recorder.report()
             if not context.pace.exact:  # there a channel may rest for as long as the slowest process needs

@@ -20,20 +20,22 @@ class Backlog:
     def __init__(self, session: zenoh.Session, key_expr: str, capacity: int) -> None:
         self._capacity = capacity
         self._session, self._key_expr = session, key_expr
+        self._kept: list[tuple[str, bytes]] = []  # taken when the subscription was renewed
         self._subscriber = self._subscribe()
 
     def _subscribe(self) -> Any:
         return self._session.declare_subscriber(self._key_expr, zenoh.handlers.RingChannel(self._capacity))
 
     def renew(self) -> None:
-        """Subscribe anew, so that every neighbour hears of it again; what is sent meanwhile, or waits, is lost."""
+        """Subscribe anew, so that every neighbour hears of it again; what is sent in that moment is lost."""
+        self._kept = self.take_all()[0]  # the ring goes with its subscription
         self._subscriber.undeclare()
         self._subscriber = self._subscribe()
 
     def take_all(self) -> tuple[list[tuple[str, bytes]], bool]:
         """(key, payload) of all that waits, oldest first, without waiting; and whether as much came as can wait."""
         take = self._subscriber.try_recv
-        taken: list[tuple[str, bytes]] = []
+        taken, self._kept = self._kept, []
         for _ in range(self._capacity):
             sample = take()
             if sample is None:

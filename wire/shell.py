@@ -7,6 +7,7 @@ loop: all that was built before it is frozen.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import os
@@ -35,22 +36,36 @@ _MCL_CURRENT_FUTURE_ONFAULT = 1 | 2 | 4  # sys/mman.h; on fault: lock what is to
 
 
 class Stop:
-    """A request to end, with its reason; set by a signal, the lifeline or the loop itself."""
+    """A request to end, with its reason; set by a signal, the lifeline or the loop itself.
+
+    A signal's handler runs amid what the main thread does, and that may be `wait`. So nothing in here holds a lock that `set` needs
+    (a `threading.Event` does, for a moment in each wait: a handler that came in that moment would wait for its own thread for ever).
+    """
 
     def __init__(self) -> None:
-        self._event = threading.Event()
+        self._asked = False
+        self._door = threading.Lock()  # held until the request; who waits waits for it
+        self._door.acquire()
         self.reason = ""
 
     def set(self, reason: str) -> None:
-        if not self._event.is_set():
-            self.reason = reason
-        self._event.set()
+        if self._asked:
+            return
+        self.reason = reason
+        self._asked = True
+        self._open()
+
+    def _open(self) -> None:
+        with contextlib.suppress(RuntimeError):  # two at once: it is open already
+            self._door.release()
 
     def __bool__(self) -> bool:
-        return self._event.is_set()
+        return self._asked
 
     def wait(self, timeout_s: float) -> bool:
-        return self._event.wait(timeout_s)
+        if not self._asked and self._door.acquire(timeout=max(0.0, timeout_s)):
+            self._open()  # for the next who waits
+        return self._asked
 
 
 @dataclass

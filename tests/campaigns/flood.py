@@ -20,7 +20,7 @@ import numpy as np
 from softloop.offline.metrics import while_armed
 from softloop.offline.run_log import open_run
 from softloop.wire.messages import constant
-from tests.campaigns.outcome import Outcome, options, steps
+from tests.campaigns.outcome import Outcome, carried_out, options, steps
 from tests.rig.rigs import running
 from tests.rig.test_whole_rig import WIDE
 from tests.security.attackers import ORIGIN, Attacker
@@ -115,8 +115,8 @@ def missed_commands(valves):
     return int(np.maximum(np.diff(answered) - 1, 0).sum()) if len(answered) else 0
 
 
-def campaign(seconds, rounds, mode):
-    outcome = Outcome("flood")
+def campaign(seconds, rounds, mode, outcome=None):
+    outcome = outcome or Outcome("flood")
     site = Site(mode)
     try:
         for _ in steps(range(rounds), "rigs under attack"):
@@ -131,4 +131,4 @@ def campaign(seconds, rounds, mode):
 
 if __name__ == "__main__":
     given = options(__doc__, seconds=20.0, rounds=3, mode="client").parse_args()
-    sys.exit(campaign(given.seconds, given.rounds, given.mode).finish(given.json))
+    sys.exit(carried_out("flood", given, lambda outcome: campaign(given.seconds, given.rounds, given.mode, outcome)))

@@ -1,6 +1,6 @@
 """Every boundary under a million random inputs: no crash, no hang, no command let through.
 
-    python -m tests.campaigns.fuzz [--inputs 1000000] [--target all] [--engine own] [--seed 1] [--json FILE]
+    python -m tests.campaigns.fuzz [--inputs 1000000] [--target all] [--engine own] [--seed 1] [--json FILE] [--resume]
 
 Engine `own` mutates good inputs blindly and fast; `atheris`, where that package is installed, looks for inputs that reach new
 code. The gate's state machine (`gate`) is driven by Hypothesis; its inputs are counted in steps.
@@ -16,12 +16,13 @@ import sys
 import traceback
 from pathlib import Path
 
-from tests.campaigns.outcome import Outcome, options, steps
+from tests.campaigns.outcome import Outcome, carried_out, options, steps
 
 HANG_S = 10.0  # of processor time for one input
 CRASHES = Path("build/campaigns/crashes")
 BYTES = ("can", "serial", "cdr", "bench", "parameters", "mcap")
-STEPS_PER_LIFE = 50
+STEPS_PER_LIFE, LIVES = 50, 500
+STEPS = "inputs of gate, in steps"
 EDGES = [
     b"\x00",
     b"\xff",
@@ -73,15 +74,16 @@ def _on_alarm(_number, _frame):
 
 
 def blind(outcome, name, inputs, seed):
-    """The own engine on one target."""
+    """The own engine on one target, from the input on at which its count stands."""
     from tests.campaigns.fuzz_targets import CORPORA, TARGETS  # noqa: PLC0415 - loads all of softloop
 
-    rng, target, corpus = random.Random(f"{seed} {name}"), TARGETS[name], CORPORA[name]()
+    done = outcome.counts.get(f"inputs of {name}", 0)
+    rng, target, corpus = random.Random(f"{seed} {name} {done}"), TARGETS[name], CORPORA[name]()
     for good in corpus:
         target(good)
     before = signal.signal(signal.SIGVTALRM, _on_alarm)
     try:
-        for _ in steps(range(inputs), name):
+        for _ in steps(range(done, inputs), name):
             data = mutated(rng, corpus)
             signal.setitimer(signal.ITIMER_VIRTUAL, HANG_S)
             try:
@@ -144,28 +146,29 @@ def machine(outcome, inputs, seed):
 
     from tests.devices.test_gate_sequences import GateMachine  # noqa: PLC0415
 
-    lives = max(1, inputs // STEPS_PER_LIFE)
-    taken = [0]
+    outcome.count(STEPS, 0)
 
     class Counted(GateMachine):
         def step(self, ask=False, **fields):
-            taken[0] += 1
+            outcome.count(STEPS)
             super().step(ask, **fields)
 
-    settings = hypothesis.settings(
-        max_examples=lives, stateful_step_count=STEPS_PER_LIFE, deadline=None, database=None,
-        suppress_health_check=list(hypothesis.HealthCheck),
-    )  # fmt: skip
-    hypothesis.seed(seed)(Counted)
-    try:
-        hypothesis.stateful.run_state_machine_as_test(Counted, settings=settings)
-    except Exception as error:  # noqa: BLE001
-        outcome.fail(f"gate: {error!r}")
-    outcome.count("inputs of gate, in steps", taken[0])
+    # A new beginning now and then: what Hypothesis notes of all lives so far would fill the memory.
+    while (left := inputs - outcome.counts[STEPS]) > 0:
+        settings = hypothesis.settings(
+            max_examples=min(LIVES, 1 + left // STEPS_PER_LIFE), stateful_step_count=STEPS_PER_LIFE, deadline=None, database=None,
+            suppress_health_check=list(hypothesis.HealthCheck),
+        )  # fmt: skip
+        hypothesis.seed(f"{seed} {outcome.counts[STEPS]}")(Counted)
+        try:
+            hypothesis.stateful.run_state_machine_as_test(Counted, settings=settings)
+        except Exception as error:  # noqa: BLE001
+            outcome.fail(f"gate: {error!r}")
+            break
 
 
-def campaign(targets, inputs, engine, seed):
-    outcome = Outcome("fuzz")
+def campaign(targets, inputs, engine, seed, outcome=None):
+    outcome = outcome or Outcome("fuzz")
     for name in targets:
         if name == "gate":
             machine(outcome, inputs, seed)
@@ -179,7 +182,7 @@ def campaign(targets, inputs, engine, seed):
 def main():
     if sys.argv[1:2] == ["--be-atheris"]:
         return be_atheris(sys.argv[2], sys.argv[3], sys.argv[4:])
-    parser = options(__doc__, inputs=1_000_000)
+    parser = options(__doc__, resumable=True, inputs=1_000_000)
     parser.add_argument("--target", choices=[*BYTES, "gate", "all"], default="all")
     parser.add_argument("--engine", choices=["own", "atheris"], default="own")
     given = parser.parse_args()
@@ -187,7 +190,7 @@ def main():
         print("fuzz: the package atheris is not installed here (pip install atheris); --engine own needs nothing")
         return 3
     targets = [*BYTES, "gate"] if given.target == "all" else [given.target]
-    return campaign(targets, given.inputs, given.engine, given.seed).finish(given.json)
+    return carried_out("fuzz", given, lambda outcome: campaign(targets, given.inputs, given.engine, given.seed, outcome))
 
 
 if __name__ == "__main__":

@@ -1,16 +1,18 @@
 """The boundaries of softloop, each as a function of bytes: whatever they are, it returns; what it must hold is asserted."""
 
+import atexit
 import contextlib
 import hashlib
 import math
 import os
+import shutil
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 
-from softloop.deploy.bench import load_bench, shipped_benches
+from softloop.deploy.bench import load_bench
 from softloop.devices import gate as g
 from softloop.devices.config import InclinometerConfig
 from softloop.devices.gate_messages import COMMAND as COMMAND_DTYPE
@@ -18,7 +20,7 @@ from softloop.devices.protocols import can_frames, wt931
 from softloop.devices.protocols.can_frames import E2eReceiver, e2e_crc
 from softloop.devices.protocols.quantise import counts_to_deg
 from softloop.devices.valves import ValvesLoop
-from softloop.dynamics.parameters import load_parameters, shipped
+from softloop.dynamics.parameters import load_parameters
 from softloop.offline.log import open_log
 from softloop.offline.log_check import check_log
 from softloop.offline.log_repair import repair_log
@@ -27,10 +29,11 @@ from softloop.wire.channels import CHANNELS, COMMAND, key
 from softloop.wire.errors import SoftloopError
 from softloop.wire.mcap_layout import BadMessage, LogWriter, Origin
 from softloop.wire.messages import BadPayload, message, message_names
+from tests.campaigns.fuzz_corpora import bench_files, log_files, parameter_files
 from tests.devices.gate_bench import GateBench
-from tests.offline import synthetic
 
 FOLDER = Path(tempfile.mkdtemp(prefix="sl-fuzz-", dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None))
+atexit.register(shutil.rmtree, FOLDER, ignore_errors=True)
 WHOLE_CAN = b"\xff" * 8
 
 
@@ -176,20 +179,11 @@ def bench(data):
     one_line(load_bench, file)
 
 
-def bench_corpus():
-    texts = [path.read_bytes() for path in shipped_benches().values() if b"base" not in path.read_bytes()]
-    return [*texts, b'name = "x"\n[can.a]\n[valves]\ncan = "a"\n[run]\nduration_s = 1\n']
-
-
 def parameters(data):
     """A parameter file."""
     file = FOLDER / "parameters.toml"
     file.write_bytes(data)
     one_line(load_parameters, file)
-
-
-def parameters_corpus():
-    return [shipped().read_bytes()]
 
 
 def mcap(data):
@@ -212,16 +206,8 @@ def mcap(data):
         assert len(again[name]) >= len(records), f"{name} was lost by the repair"
 
 
-def mcap_corpus():
-    made = list(synthetic.messages(0.02))
-    files = []
-    for finish, size in ((True, 600), (False, 4000)):
-        files.append(synthetic.write_log(FOLDER / "seed.mcap", made, finish=finish, chunk_bytes=size).read_bytes())
-    return files
-
-
 TARGETS = {f.__name__: f for f in (can, serial, cdr, bench, parameters, mcap)}
 CORPORA = {
-    "can": can_corpus, "serial": serial_corpus, "cdr": cdr_corpus, "bench": bench_corpus, "parameters": parameters_corpus,
-    "mcap": mcap_corpus,
+    "can": can_corpus, "serial": serial_corpus, "cdr": cdr_corpus, "bench": lambda: bench_files(FOLDER),
+    "parameters": parameter_files, "mcap": lambda: log_files(FOLDER),
 }  # fmt: skip

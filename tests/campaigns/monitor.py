@@ -35,7 +35,7 @@ from softloop.watch.invariants import (
 )
 from softloop.watch.monitor import limits_of, parameters_of
 from softloop.wire.messages import constant
-from tests.campaigns.outcome import Outcome, options, steps
+from tests.campaigns.outcome import Outcome, carried_out, options, steps
 
 LAWS, TRAJECTORIES = ("arc", "smc", "pid", "arc_eso", "pid_eso"), ("t1", "t2")
 CASES = list(product(TRAJECTORIES, LAWS))
@@ -160,9 +160,9 @@ def broken(outcome, seed, law, kind):
         outcome.count(f"broken rigs, {what}: driven on within all limits")
 
 
-def campaign(rigs, broken_rigs, seed):
+def campaign(rigs, broken_rigs, seed, outcome=None):
     """Run it; returns the outcome."""
-    outcome, rng = Outcome("monitor"), random.Random(seed)
+    outcome, rng = outcome or Outcome("monitor"), random.Random(seed)
     for number in steps(range(rigs), "fault-free rigs"):
         trajectory, law = CASES[number % len(CASES)]
         fault_free(outcome, seed + number, law, trajectory, rng)
@@ -173,7 +173,7 @@ def campaign(rigs, broken_rigs, seed):
 
 def main():
     given = options(__doc__, rigs=100, broken=20).parse_args()
-    return campaign(given.rigs, given.broken, given.seed).finish(given.json)
+    return carried_out("monitor", given, lambda outcome: campaign(given.rigs, given.broken, given.seed, outcome))
 
 
 if __name__ == "__main__":

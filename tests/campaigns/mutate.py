@@ -1,6 +1,6 @@
 """Mutants of the safety gate and of the valve driver's watchdog: each must fail a test, or be justified in writing.
 
-    python -m tests.campaigns.mutate [--one-in 1] [--module gate] [--seed 1] [--json FILE]
+    python -m tests.campaigns.mutate [--one-in 1] [--module gate] [--seed 1] [--json FILE] [--resume]
 
 Kernels run as plain Python here. Each mutant lives in a process of its own, forked from one that has loaded everything; there it
 takes the place of the module's functions, and the tests run until the first one fails. One that does not end in time counts as
@@ -28,7 +28,7 @@ import scipy.optimize  # noqa: F401
 
 from tests.campaigns.justified import JUSTIFIED
 from tests.campaigns.mutants import mutants_of
-from tests.campaigns.outcome import Outcome, options, steps
+from tests.campaigns.outcome import Outcome, carried_out, options, steps
 from tests.devices import test_gate, test_gate_sequences  # noqa: F401
 from tests.plant import test_watchdog  # noqa: F401
 
@@ -74,7 +74,12 @@ def judge(target, tree, file):
     if child == 0:
         resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))
         os._exit(_be_mutant(target, tree, file))
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    try:
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    except KeyboardInterrupt:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        raise
     if code == -signal.SIGXCPU:
         return None
     return SURVIVED if code == 0 else KILLED
@@ -97,15 +102,15 @@ def _be_mutant(target, tree, file):
     return SURVIVED if code == 0 else KILLED
 
 
-def campaign(names, one_in, seed):
-    """Judge every `one_in`-th mutant of the named targets, beginning at a place that `seed` gives."""
-    outcome = Outcome("mutate")
+def campaign(names, one_in, seed, outcome=None):
+    """Judge every `one_in`-th mutant of the named targets, beginning at a place that `seed` gives; those counted are done."""
+    outcome = outcome or Outcome("mutate")
     for name in names:
         target = TARGETS[name]
         file, source = source_of(target)
         all_of_them = list(mutants_of(source, target.functions))
         _check_justifications(outcome, name, {m.name for m in all_of_them})
-        chosen = all_of_them[random.Random(seed).randrange(one_in) :: one_in]
+        chosen = all_of_them[random.Random(seed).randrange(one_in) :: one_in][outcome.counts.get(f"mutants of {name}", 0) :]
         if judge(target, ast.parse(source), file) != SURVIVED:
             outcome.fail(f"{name}: the tests fail without any mutant")
             continue
@@ -134,11 +139,11 @@ def _check_justifications(outcome, name, there):
 
 
 def main():
-    parser = options(__doc__, one_in=1)
+    parser = options(__doc__, resumable=True, one_in=1)
     parser.add_argument("--module", choices=[*TARGETS, "all"], default="all")
     given = parser.parse_args()
     names = list(TARGETS) if given.module == "all" else [given.module]
-    return campaign(names, given.one_in, given.seed).finish(given.json)
+    return carried_out("mutate", given, lambda outcome: campaign(names, given.one_in, given.seed, outcome))
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from softloop.plant.records import EVENT
 from softloop.plant.setup import WireTimes, new_device, new_state, plant_record
 from softloop.wire.kernel import new_record
 from softloop.wire.schedule import PERIOD_NS, START_NS, make_schedule
-from tests.campaigns.outcome import Outcome, options, steps
+from tests.campaigns.outcome import Outcome, carried_out, options, steps
 
 LAWS = ("arc", "smc", "pid", "arc_eso", "pid_eso", "pressure")
 FAULT_S = (8.0, 28.0)  # of the plant's time: on the trajectory of all
@@ -104,9 +104,9 @@ def rearmed(outcome, law, seed, fault_s, arm_after_s):
     judge(outcome, name, law, cycles, truths, arm_after_s)
 
 
-def campaign(rigs, seed):
+def campaign(rigs, seed, outcome=None):
     """Run it; returns the outcome."""
-    outcome, rng = Outcome("rearm"), random.Random(seed)
+    outcome, rng = outcome or Outcome("rearm"), random.Random(seed)
     for number in steps(range(rigs), "rigs"):
         for law in LAWS:
             fault_s = rng.uniform(*FAULT_S)
@@ -117,7 +117,7 @@ def campaign(rigs, seed):
 
 def main():
     given = options(__doc__, rigs=100).parse_args()
-    return campaign(given.rigs, given.seed).finish(given.json)
+    return carried_out("rearm", given, lambda outcome: campaign(given.rigs, given.seed, outcome))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""A recorder in a process of its own, for the kill campaign; arguments: endpoint, folder, name, limit of file size or 0."""
+"""A recorder in a process of its own, for the kill campaign; arguments: endpoint, folder, name, limit of file size or 0.
+
+Its standard input is its lifeline: it ends when the campaign does, however that ends.
+"""
 
 import resource
 import signal
@@ -9,7 +12,7 @@ from softloop.watch.config import RecorderConfig
 from softloop.watch.recorder import run
 from softloop.wire.config import ZenohConfig
 from softloop.wire.session import open_wire
-from softloop.wire.shell import Context, Stop
+from softloop.wire.shell import Context, Stop, watch_lifeline
 
 BENCH = "kill"
 
@@ -17,6 +20,7 @@ BENCH = "kill"
 def main(endpoint, run_dir, name, limit_bytes):
     stop = Stop()
     signal.signal(signal.SIGTERM, lambda *_: stop.set("SIGTERM"))
+    watch_lifeline(sys.stdin.fileno(), stop)
     if int(limit_bytes):
         resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit_bytes), resource.RLIM_INFINITY))
     with open_wire(ZenohConfig(mode="client", lease_ms=20_000, endpoint=endpoint), BENCH, name) as wire:

@@ -48,7 +48,7 @@ class Bench:
         self.socket_dir = tempfile.TemporaryDirectory(prefix="sl", dir="/tmp")
         # On a busy machine a link must not be given up for a pause of half a second.
         self.zenoh = ZenohConfig(mode="client", lease_ms=10_000, endpoint=f"unixsock-stream/{self.socket_dir.name}/m.sock")
-        self.config = RecorderConfig(poll_s=0.005, flush_s=0.05, **config)
+        self.config = RecorderConfig(**{"poll_s": 0.005, "flush_s": 0.05, **config})
 
     def __enter__(self):
         self.router = open_router(self.zenoh, BENCH)
@@ -255,6 +255,62 @@ def test_when_the_disk_takes_nothing_for_long_new_messages_go_and_are_counted(tm
     assert kept[: len(kept) // 2] == list(range(1, len(kept) // 2 + 1))
     # The recorder's own words may be among what was dropped.
     assert len(kept) + account["dropped_storage"] >= 4000
+
+
+def incompressible(seq):
+    """A cycle record of this number."""
+    return pressure(seq)[:20] + os.urandom(message("CycleRecord").size - 20)
+
+
+def test_a_full_chunk_goes_to_the_disk_at_once(tmp_path):
+    with Bench(tmp_path, flush_s=60.0, chunk_kib=4) as bench:
+        begun = (tmp_path / "run.mcap").stat().st_size
+        for seq in range(1, 101):
+            bench.put(key(BENCH, CYCLE), incompressible(seq))
+        bench.until(lambda: (tmp_path / "run.mcap").stat().st_size > begun + 4096)
+
+
+def test_who_asks_the_recorder_to_end_may_kill_it_while_it_waits_for_the_last_words(tmp_path):
+    """All that it heard before is on the disk first, and what comes then goes there when it is due."""
+    log, seq = tmp_path / "run.mcap", 1
+    with Bench(tmp_path, flush_s=60.0, drain_s=60.0) as bench:
+        begun = log.stat().st_size
+        bench.put(key(BENCH, CYCLE), incompressible(seq))
+        bench.until(lambda: key(BENCH, CYCLE) in bench.recorder.account.topics)
+        assert log.stat().st_size == begun, "it waits for its flush"
+        bench.context.stop.set("test")
+        while log.stat().st_size == begun:
+            seq = speak_on(bench, seq)
+        before = log.stat().st_size
+        bench.recorder.config = bench.config.model_copy(update={"flush_s": 0.1})
+        while log.stat().st_size == before:
+            seq = speak_on(bench, seq)
+    assert [m.sequence for m in bench.messages(key(BENCH, CYCLE))] == list(range(1, seq + 1))
+
+
+def speak_on(bench, seq):
+    """Who still speaks keeps the recorder from its end; the number of the message."""
+    assert bench.thread.is_alive()
+    assert seq < 20_000
+    bench.put(key(BENCH, CYCLE), incompressible(seq + 1))
+    time.sleep(0.001)
+    return seq + 1
+
+
+def test_a_renewed_subscription_keeps_what_waits(tmp_path):
+    with Bench(tmp_path, poll_s=0.5) as bench:
+        other = bench.guest.everything(1000)
+        witness = bench.guest.inbox(PRESSURE)
+        for seq in range(1, 11):
+            bench.put(key(BENCH, PRESSURE), pressure(seq))
+        for _ in range(10):
+            assert witness.take(END_S)
+        time.sleep(0.1)
+        other.renew()
+        bench.put(key(BENCH, PRESSURE), pressure(11))
+        got = []
+        bench.until(lambda: got.extend(p for k, p in other.take_all()[0] if k == key(BENCH, PRESSURE)) or len(got) >= 11)
+    assert got == [pressure(seq) for seq in range(1, 12)]
 
 
 def test_a_log_that_cannot_be_begun_is_said_before_the_run(tmp_path):

@@ -4,10 +4,12 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
 
+from softloop.wire.shell import Stop
 from tests.wire.rendezvous import short_folder
 
 SCRIPT = """
@@ -88,3 +90,38 @@ def test_errors_are_one_line_with_their_exit_code_and_faults_keep_their_trace():
         assert "ZeroDivisionError" in err.splitlines()[-1]
         assert process.returncode == 4
         assert "boom" in (folder / "proc.trace.txt").read_text()
+
+
+AMID_A_WAIT = """
+import random, signal, sys
+from softloop.wire.shell import Stop
+rng, stop = random.Random(1), Stop()
+signal.signal(signal.SIGALRM, lambda *_: stop.set("alarm"))
+for _ in range(int(sys.argv[1])):
+    stop = Stop()
+    signal.setitimer(signal.ITIMER_REAL, rng.uniform(1e-6, 2e-4))
+    while not stop:
+        stop.wait(1e-6)
+    assert stop.wait(60.0) and stop.wait(0.0) and stop.reason == "alarm"
+print("every time")
+"""
+
+
+def test_a_signal_amid_a_wait_is_heard_every_time():
+    """With a lock that both need, held for a moment in each wait, some of these never end."""
+    done = subprocess.run([sys.executable, "-c", AMID_A_WAIT, "20000"], capture_output=True, text=True, timeout=120)
+    assert done.stdout == "every time\n", done.stderr
+
+
+def test_a_stop_wakes_all_who_wait_and_keeps_the_first_reason():
+    stop, woken = Stop(), []
+    assert not stop
+    assert not stop.wait(-1.0)
+    waiting = [threading.Thread(target=lambda: woken.append(stop.wait(20.0))) for _ in range(5)]
+    for thread in waiting:
+        thread.start()
+    stop.set("first")
+    stop.set("second")
+    for thread in waiting:
+        thread.join(20.0)
+    assert (woken, stop.reason, bool(stop)) == ([True] * 5, "first", True)
