@@ -155,5 +155,5 @@ def _reachable(function, path):
 
 
 def _with(tree, function, mutated):
-    module = ast.Module([mutated if node is function else node for node in tree.body], tree.type_ignores)
-    return ast.fix_missing_locations(copy.deepcopy(module))
+    ast.fix_missing_locations(mutated)
+    return ast.Module([mutated if node is function else node for node in tree.body], tree.type_ignores)

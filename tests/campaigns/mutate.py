@@ -2,35 +2,32 @@
 
     python -m tests.campaigns.mutate [--one-in 1] [--module gate] [--seed 1] [--json FILE] [--resume]
 
-Kernels run as plain Python here. Each mutant lives in a process of its own, forked from one that has loaded everything; there it
-takes the place of the module's functions, and the tests run until the first one fails. One that does not end in time counts as
-killed too, and is counted apart.
+Kernels run as plain Python here. Each mutant lives in a process of its own, forked from one in which pytest has loaded and
+collected everything; there it takes the place of the module's functions, and the tests run until the first one fails. One that
+does not end in time counts as killed too, and is counted apart.
 """
 
 import ast
-import contextlib
 import importlib
-import io
+import importlib.util
 import os
 import random
 import resource
 import signal
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 os.environ["NUMBA_DISABLE_JIT"] = "1"  # before numba is loaded
 
 import hypothesis
-import numba  # noqa: F401 - this and the tests are loaded before the forks, for speed
 import pytest
-import scipy.optimize  # noqa: F401
+from _pytest.main import pytest_runtestloop as run_tests
 
 from tests.campaigns.justified import JUSTIFIED
 from tests.campaigns.mutants import mutants_of
 from tests.campaigns.outcome import Outcome, carried_out, options, steps
-from tests.devices import test_gate, test_gate_sequences  # noqa: F401
-from tests.plant import test_watchdog  # noqa: F401
 
 LIMIT_S = 60  # of processor time
 KILLED, SURVIVED = 1, 0
@@ -53,7 +50,9 @@ TARGETS = {
             "command_reason", "take_command", "driver_now", "condition", "arm_is_new", "change_state", "vent_output", "limited",
             "gate_step",
         ),
-        ("tests/devices/test_gate.py", "tests/devices/test_gate_sequences.py", "-k", _QUICK),
+        (
+            "tests/devices/test_gate_edges.py", "tests/devices/test_gate.py", "tests/devices/test_gate_sequences.py", "-k", _QUICK,
+        ),
     ),
     "watchdog": Target(
         "softloop.plant.electrical",
@@ -64,16 +63,34 @@ TARGETS = {
 
 
 def source_of(target):
-    spec = importlib.util.find_spec(target.module)
-    return Path(spec.origin), Path(spec.origin).read_text()
+    return Path(importlib.util.find_spec(target.module).origin).read_text()
 
 
-def judge(target, tree, file):
+class Judge:
+    """A pytest plugin that, instead of running the collected tests once, runs them against each mutant."""
+
+    def __init__(self, target, judge_all):
+        self._target, self._judge_all = target, judge_all
+        self.reached = False
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session):
+        self.reached = not session.testsfailed and bool(session.items)
+        if self.reached:
+            self._judge_all(lambda tree: judge(self._target, tree, session))
+        return True
+
+
+def judge(target, tree, session):
     """In a process of its own: load the mutant and run the tests. Returns KILLED, SURVIVED, or None for no end in time."""
     child = os.fork()
     if child == 0:
         resource.setrlimit(resource.RLIMIT_CPU, (LIMIT_S, LIMIT_S))
-        os._exit(_be_mutant(target, tree, file))
+        code = KILLED
+        try:
+            code = _be_mutant(target, tree, session)
+        finally:
+            os._exit(code)
     try:
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     except KeyboardInterrupt:
@@ -82,41 +99,50 @@ def judge(target, tree, file):
         raise
     if code == -signal.SIGXCPU:
         return None
-    return SURVIVED if code == 0 else KILLED
+    return SURVIVED if code == SURVIVED else KILLED
 
 
-def _be_mutant(target, tree, file):
-    hypothesis.settings.register_profile("mutate", derandomize=True, database=None, print_blob=False)
-    hypothesis.settings.load_profile("mutate")
+def _be_mutant(target, tree, session):
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)
         os.dup2(nowhere.fileno(), 2)
+    # Into the module that is loaded: its functions find each other, and the tests find them, by the module's names.
+    module = importlib.import_module(target.module)
+    exec(compile(tree, module.__file__, "exec"), module.__dict__)  # one that cannot be loaded is dead
     try:
-        # Into the module that is loaded: its functions find each other, and the tests find them, by the module's names.
-        module = importlib.import_module(target.module)
-        exec(compile(tree, str(file), "exec"), module.__dict__)
-    except Exception:  # noqa: BLE001 - a mutant that cannot be loaded is dead
+        run_tests(session)
+    except session.Failed:  # the first failure ends it
         return KILLED
-    with contextlib.redirect_stdout(io.StringIO()):
-        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--no-header", *target.tests])
-    return SURVIVED if code == 0 else KILLED
+    return KILLED if session.testsfailed else SURVIVED
 
 
 def campaign(names, one_in, seed, outcome=None):
     """Judge every `one_in`-th mutant of the named targets, beginning at a place that `seed` gives; those counted are done."""
     outcome = outcome or Outcome("mutate")
+    hypothesis.settings.register_profile("mutate", derandomize=True, database=None, print_blob=False)
+    hypothesis.settings.load_profile("mutate")  # before the tests are loaded, whose settings begin with it
     for name in names:
         target = TARGETS[name]
-        file, source = source_of(target)
+        source = source_of(target)
         all_of_them = list(mutants_of(source, target.functions))
         _check_justifications(outcome, name, {m.name for m in all_of_them})
         chosen = all_of_them[random.Random(seed).randrange(one_in) :: one_in][outcome.counts.get(f"mutants of {name}", 0) :]
-        if judge(target, ast.parse(source), file) != SURVIVED:
-            outcome.fail(f"{name}: the tests fail without any mutant")
-            continue
-        for mutant in steps(chosen, name):
-            _count(outcome, name, mutant, judge(target, mutant.tree, file))
+        judging = Judge(target, partial(_judge_all, outcome, name, ast.parse(source), chosen))
+        how = ["-x", "-q", "-s", "-p", "no:cacheprovider", "--no-header", "--disable-warnings"]
+        code = pytest.main([*how, *target.tests], plugins=[judging])
+        if code == pytest.ExitCode.INTERRUPTED:
+            raise KeyboardInterrupt
+        if code != pytest.ExitCode.OK or not judging.reached:
+            outcome.fail(f"{name}: the tests could not be collected, or pytest ended in an error: {code!r}")
     return outcome
+
+
+def _judge_all(outcome, name, unchanged, chosen, judged):
+    if judged(unchanged) != SURVIVED:
+        outcome.fail(f"{name}: the tests fail without any mutant")
+        return
+    for mutant in steps(chosen, name):
+        _count(outcome, name, mutant, judged(mutant.tree))
 
 
 def _count(outcome, name, mutant, verdict):

@@ -1,0 +1,141 @@
+"""The gate at its edges: limits met exactly, the first instants of a clock, numbers of commands and of who asks to arm."""
+
+import pytest
+
+from softloop.devices import gate as g
+from softloop.devices.config import PERIOD_NS
+from tests.devices.gate_bench import GateBench, word
+
+MS = 1_000_000
+NAN = float("nan")
+
+
+def test_the_other_limits_themselves_are_allowed():
+    output = GateBench().armed().tick(angle_deg=-20.0, charge_current_ma=0.0, exhaust_current_ma=220.0)
+    assert (word(output), output.exhaust_counts) == ((g.GATE_ARMED, g.OUTPUT_PASS, g.REASON_NONE), 22_000)
+    assert GateBench().armed().tick(exhaust_current_ma=220.01).reason == g.REASON_OUT_OF_RANGE
+
+
+@pytest.mark.parametrize("behind", [0, 1, 39])
+def test_a_command_that_is_not_newer_says_nothing(behind):
+    bench = GateBench().armed()
+    assert bench.tick(command_seq=bench.seq - behind, charge_current_ma=NAN).gate == g.GATE_ARMED
+
+
+def test_a_command_farther_behind_is_another_controllers():
+    bench = GateBench().armed()
+    assert bench.tick(command_seq=bench.seq - 40).reason == g.REASON_CONTROLLER_LOST
+
+
+def test_a_first_command_without_a_number_does_not_arm_but_its_pressure_counts():
+    bench = GateBench()
+    assert bench.tick(command_seq=0, chamber_pressure_kpa=0.0).output == g.OUTPUT_CLOSED
+    assert bench.arm(command_seq=0).refused == g.REASON_CONTROLLER_LOST
+    assert bench.arm(command_seq=1).gate == g.GATE_ARMED
+
+
+def test_in_the_first_instant_of_the_clock_all_that_was_heard_counts():
+    bench = GateBench()
+    bench.now_ns = 0
+    output = bench.tick(after_ns=1, pressure_stamp_ns=1, inclination_stamp_ns=1, chamber_pressure_kpa=0.0)
+    assert (output.output, output.driver) == (g.OUTPUT_CLOSED, g.DRIVER_OK)
+    assert bench.arm(command=False, heard=False, after_ns=1).gate == g.GATE_ARMED
+
+
+def test_near_the_beginning_of_the_clock_what_was_never_heard_does_not_count():
+    bench = GateBench()
+    bench.now_ns = 0
+    output = bench.tick(command=False, heard=False)
+    assert (output.output, output.driver) == (g.OUTPUT_VENT, g.DRIVER_SILENT)
+
+
+@pytest.mark.parametrize(("stamp_ns", "output"), [(0, g.OUTPUT_CLOSED), (1, g.OUTPUT_VENT), (2**62, g.OUTPUT_VENT)])
+def test_a_pressure_ends_the_venting_up_to_this_very_moment(stamp_ns, output):
+    """`stamp_ns` is after the gate's step."""
+    bench = GateBench()
+    now_ns = bench.now_ns + PERIOD_NS
+    assert bench.tick(pressure_stamp_ns=now_ns + stamp_ns, chamber_pressure_kpa=0.0).output == output
+
+
+@pytest.mark.parametrize(("older_ns", "output"), [(0, g.OUTPUT_CLOSED), (1, g.OUTPUT_VENT)])
+def test_a_pressure_ends_the_venting_while_it_is_fresh(older_ns, output):
+    bench = GateBench()
+    stamp_ns = bench.now_ns + PERIOD_NS - bench.process.pressure_age_ns - older_ns
+    assert bench.tick(pressure_stamp_ns=stamp_ns, chamber_pressure_kpa=0.0).output == output
+
+
+@pytest.mark.parametrize("bad", [{"pressure_stamp_ns": 0}, {"chamber_pressure_kpa": NAN}])
+def test_a_pressure_that_is_none_leaves_the_last_one_standing(bad):
+    bench = GateBench(vent_settle_s=0.02)
+    empty = {"chamber_pressure_kpa": 0.0}
+    outputs = [int(bench.tick(**(empty | more)).output) for more in ({}, {}, bad, {}, {})]
+    assert outputs == [g.OUTPUT_VENT] * 4 + [g.OUTPUT_CLOSED]
+
+
+def request(bench, origin, seq, **fields):
+    return bench.tick(arm=1, arm_origin=origin, arm_seq=seq, **fields)
+
+
+@pytest.mark.parametrize("origin", [0, 77])
+def test_a_first_request_arms_whatever_its_number(origin):
+    bench = GateBench()
+    bench.tick()
+    assert request(bench, origin, 0).gate == g.GATE_ARMED
+
+
+def test_an_older_request_does_not_make_a_used_one_new():
+    bench = GateBench().armed()
+    assert request(bench, 5, 9).gate == g.GATE_ARMED
+    bench.tick(stop=1)
+    for seq in (9, 3, 9):
+        assert request(bench, 5, seq).gate == g.GATE_FAULT
+    assert request(bench, 5, 10).gate == g.GATE_ARMED
+
+
+def test_eight_who_asked_are_remembered_and_of_nine_the_first_is_forgotten():
+    bench = GateBench()
+    bench.tick()
+    for origin in range(8):
+        bench.tick(stop=1)
+        assert request(bench, origin, 1).gate == g.GATE_ARMED
+    bench.tick(stop=1)
+    for origin in range(8):
+        assert request(bench, origin, 1).gate == g.GATE_FAULT
+    assert request(bench, 8, 1).gate == g.GATE_ARMED
+    bench.tick(stop=1)
+    for origin in range(1, 9):
+        assert request(bench, origin, 1).gate == g.GATE_FAULT
+    assert request(bench, 0, 1).gate == g.GATE_ARMED
+    bench.tick(stop=1)
+    assert request(bench, 2, 1).gate == g.GATE_FAULT, "the one heard second is still remembered"
+
+
+def test_a_stop_gives_a_fault_its_reason_anew_and_that_is_a_change():
+    bench = GateBench().armed()
+    bench.tick(angle_deg=201.0)
+    output = bench.tick(stop=g.STOP_ASKED)
+    assert (*word(output), output.changed) == (g.GATE_FAULT, g.OUTPUT_VENT, g.REASON_EMERGENCY_STOP, 1)
+    assert bench.tick(stop=g.STOP_ASKED).changed == 0
+
+
+def test_steps_are_counted():
+    bench = GateBench()
+    for _ in range(3):
+        bench.tick()
+    assert bench.state.steps == 3
+
+
+@pytest.mark.parametrize(
+    ("charge", "exhaust", "passed"), [(100.0, 70.0, 100.0), (100.0, 70.01, 70.0), (30.0, 150.0, 30.0), (80.0, 0.0, 80.0)]
+)
+def test_the_charge_current_is_held_only_while_the_exhaust_is_above_the_overlap(charge, exhaust, passed):
+    output = GateBench().armed().tick(charge_current_ma=charge, exhaust_current_ma=exhaust)
+    assert (output.charge_current_ma, output.exhaust_current_ma) == (passed, exhaust)
+
+
+@pytest.mark.parametrize(
+    ("asked", "sent", "passed"),
+    [(50.0, 50.0, 50.0), (90.0, 50.0, 80.0), (10.0, 50.0, 20.0), (0.0, 10.0, 0.0), (-5.0, 10.0, 0.0), (300.0, 210.0, 220.0), (0.5, 0.0, 0.5)],
+)
+def test_a_current_is_within_its_range_and_within_a_steps_change(asked, sent, passed):
+    assert g.limited(asked, sent, 30.0, 220.0) == passed
