@@ -22,7 +22,7 @@ from pydantic import Field, ValidationError
 from softloop.controller.config import ControllerConfig
 from softloop.deploy.config import CalibrationConfig, MachineConfig, RunConfig
 from softloop.deploy.hosts import check_hosts
-from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig, pressures_process, valves_process
+from softloop.devices.config import InclinometerConfig, PressuresConfig, ValvesConfig, bus_of, pressures_process, valves_process
 from softloop.plant.config import PlantConfig, emulated_buses, plant_process
 from softloop.plant.shadow_config import ShadowConfig, shadow_process
 from softloop.watch.config import FoxgloveConfig, LawGains, MonitorConfig, MonitorProcess, PageConfig, RecorderConfig
@@ -160,7 +160,7 @@ def process_config(bench: Bench, name: str) -> Any:
     if name == "shadow":
         if bench.valves is None:
             raise BadConfig("key 'shadow': the shadow follows the valve currents and needs the table [valves] too")
-        return shadow_process(table, bench.can[bench.valves.can].bitrate)
+        return shadow_process(table, bus_of(bench.can, "valves", bench.valves.can).bitrate)
     if name == "monitor":
         if bench.controller is None:
             raise BadConfig("key 'monitor': the monitor needs the table [controller] too")

@@ -183,11 +183,11 @@ def valves_process(
     if valves.pressure_max_kpa >= limit_kpa:
         raise BadConfig(f"key 'valves.pressure_max_kpa': must be below what the chamber sensor can read ({limit_kpa:g} kPa)")
     path_ns, slack_ns = round(valves.path_delay_ms * 1e6), valves.age_ticks * PERIOD_NS
-    analog_ns = can_frame_ns(ANALOG_DLC, _bus(buses, "pressures", pressures.can).bitrate)
+    analog_ns = can_frame_ns(ANALOG_DLC, bus_of(buses, "pressures", pressures.can).bitrate)
     bytes_ns = serial_ns(SAMPLE_BYTES, inclinometer.baud)
     return ValvesProcess(
         valves,
-        _bus(buses, "valves", valves.can),
+        bus_of(buses, "valves", valves.can),
         age_budget_ns(round(1e9 / pressures.rate_hz), analog_ns, path_ns, slack_ns),
         age_budget_ns(round(1e9 / inclinometer.rate_hz), bytes_ns, path_ns, slack_ns),
     )
@@ -195,7 +195,7 @@ def valves_process(
 
 def pressures_process(pressures: PressuresConfig, buses: Mapping[str, CanConfig]) -> PressuresProcess:
     """The config of `pressures` with its bus. Raises BadConfig on an unknown bus."""
-    return PressuresProcess(pressures, _bus(buses, "pressures", pressures.can))
+    return PressuresProcess(pressures, bus_of(buses, "pressures", pressures.can))
 
 
 def analog_config(config: PressuresProcess) -> AnalogConfig:
@@ -217,7 +217,8 @@ def sampler_bounds(config: InclinometerConfig) -> SamplerConfig:
     )
 
 
-def _bus(buses: Mapping[str, CanConfig], table: str, name: str) -> CanConfig:
+def bus_of(buses: Mapping[str, CanConfig], table: str, name: str) -> CanConfig:
+    """The bus that a process's table names. Raises BadConfig when there is none of that name."""
     if name not in buses:
         raise BadConfig(f"key '{table}.can': there is no [can.{name}]; there are: {', '.join(sorted(buses)) or '(none)'}")
     return buses[name]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections import namedtuple
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +59,7 @@ class MessageType:
         self._zero = tuple((0,) * f.length if f.length else 0 for f in self.fields)
         self._has_arrays = any(f.length for f in self.fields)
 
-    @property
+    @cached_property
     def dtype(self) -> np.dtype[Any]:
         """An aligned record dtype; its first `cdr_size` bytes are the message without the CDR header."""
         spec = [(f.name, _numpy_format(f.base), (f.length,) if f.length else ()) for f in self.fields]

@@ -7,7 +7,7 @@ from pydantic import BaseModel
 
 from softloop.deploy.bench import Bench, shipped_benches
 from softloop.dynamics.parameters import load_parameters, shipped
-from softloop.wire.channels import CAN, PRESSURE, REQUEST, can_key, key
+from softloop.wire.channels import CAN, REQUEST, can_key, key
 from softloop.wire.mcap_chunks import ChunkedWriter
 from softloop.wire.mcap_layout import LIBRARY, MESSAGE_ENCODING, METADATA_NAME, PROFILE, SCHEMA_ENCODING, Origin, topic_of_key
 from softloop.wire.messages import message
@@ -69,11 +69,11 @@ def _value(value):
 
 
 def log_files(folder):
-    """Small logs of three channels, finished and cut off, with many chunks and few; and two of all channels."""
-    small = [_small_log(finish, size) for finish in (True, False) for size in (100, 300, 4000)]
+    """Small logs of two channels, finished and cut off, in two chunks and in one; and, one in fifty, logs of all channels."""
+    small = [_small_log(finish, size) for finish in (True, False) for size in (1200, 4000)]
     made = list(synthetic.messages(0.02))
     whole = [synthetic.write_log(folder / "seed.mcap", made, finish=f, chunk_bytes=n).read_bytes() for f, n in ((True, 600), (False, 4000))]
-    return small * 6 + whole
+    return small * 25 + whole
 
 
 def _small_log(finish, chunk_bytes):
@@ -82,11 +82,11 @@ def _small_log(finish, chunk_bytes):
     writer.add_attachment(1000, "git.json", "application/json", synthetic.GIT)
     writer.add_metadata(METADATA_NAME, Origin("b", 1000, 0).as_metadata())
     lanes = []
-    for channel, full_key in ((PRESSURE, key("b", PRESSURE)), (REQUEST, key("b", REQUEST)), (CAN, can_key("b", "can0", 0x80))):
+    for channel, full_key in ((REQUEST, key("b", REQUEST)), (CAN, can_key("b", "can0", 0x80))):
         kind = message(channel.message)
         schema = writer.add_schema(kind.ros_name, SCHEMA_ENCODING, kind.text.encode())
         lanes.append((kind, writer.add_channel(topic_of_key(full_key), MESSAGE_ENCODING, schema)))
-    for seq in range(1, 5):
+    for seq in range(1, 4):
         for kind, channel_id in lanes:
             writer.add_message(channel_id, 1000 + seq, seq, kind.pack(kind.make(seq=seq, stamp_ns=seq)))
     writer.flush()

@@ -282,6 +282,12 @@ def test_loading_a_bench_imports_neither_numba_nor_scipy():
     assert done.stdout.strip() == "[]"
 
 
+def test_a_shadow_on_a_bus_that_is_not_there_is_refused_in_one_line(tmp_path):
+    file = write(tmp_path, "name = 'x'\n[can.can1]\n[shadow]\n[valves]\n")
+    with pytest.raises(BadConfig, match=r"key 'valves\.can': there is no \[can\.can0\]; there are: can1$"):
+        load_bench(file)
+
+
 def test_a_kept_bench_is_toml_that_others_can_read(tmp_path):
     kept = keep_bench(tmp_path, load_bench(shipped_benches()["sim"], tmp_path))
     assert tomllib.loads(kept.read_text())["controller"]["trajectory"] == "t1"
