@@ -1,7 +1,17 @@
 """Mutants that no test can kill, each with the reason why it changes nothing that matters."""
 
 JUSTIFIED = {
-    "gate": {},
+    "gate": {
+        "change_state: output.refused = reason if asked and event != EVENT_ARM else REASON_NONE -> output.refused = reason if asked "
+        "else REASON_NONE": (
+            "The event is ARM only where the branches before it were not taken, and the second of them is taken for every reason but "
+            "REASON_NONE: with ARM the reason is REASON_NONE anyway."
+        ),
+        "change_state: if state.gate != before and state.gate != GATE_ARMED: -> if state.gate != before:": (
+            "On arming, too, the venting would begin anew; but while armed nothing reads it, and every way out of ARMED sets both of "
+            "its fields again."
+        ),
+    },
     "watchdog": {
         "accept_command: if driver.waiting > 0: -> if driver.waiting >= 0:": (
             "With an empty queue the place before is that of the frame applied last, whose due time the physics has reached; a "
