@@ -38,8 +38,8 @@ _MCL_CURRENT_FUTURE_ONFAULT = 1 | 2 | 4  # sys/mman.h; on fault: lock what is to
 class Stop:
     """A request to end, with its reason; set by a signal, the lifeline or the loop itself.
 
-    A signal's handler runs amid what the main thread does, and that may be `wait`. So nothing in here holds a lock that `set` needs
-    (a `threading.Event` does, for a moment in each wait: a handler that came in that moment would wait for its own thread for ever).
+    A signal's handler runs amid what the main thread does, and that may be `wait`. So nothing in here holds a lock that `set`
+    needs (a `threading.Event` does, for a moment in each wait: a handler that comes then waits for its own thread for ever).
     """
 
     def __init__(self) -> None:

@@ -47,7 +47,9 @@ class SmallDisk:
 
     def __init__(self, run_dir, room):
         command = ["unshare", "--mount", "sh", "-c", MOUNT, "sh", str(run_dir), str(DISK_BYTES)]
-        self._holder = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        self._holder = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
         said = self._holder.stdout.readline().strip()
         if said != "mounted":
             self.close()

@@ -33,24 +33,32 @@ def bench_files(folder):
     (folder / "base.toml").write_text('name = "b"\n[run]\narm = false\n[monitor]\n[controller]\n')
     (folder / "piece.toml").write_text("[controller]\napproach_s = 2.0\n")
     tables = [name for name, field in Bench.model_fields.items() if _model_of(field.annotation) is not None]
-    return [*(text for name in tables for text in _files_of(name)), *MORE_BENCHES, *(p.read_bytes() for p in shipped_benches().values())]
+    return [
+        *(text for name in tables for text in _files_of(name)),
+        *MORE_BENCHES,
+        *(p.read_bytes() for p in shipped_benches().values()),
+    ]
 
 
 def _model_of(annotation):
     """The table a field of the bench holds, or None."""
-    found = [one for one in (annotation, *getattr(annotation, "__args__", ())) if isinstance(one, type) and issubclass(one, BaseModel)]
+    found = [
+        one for one in (annotation, *getattr(annotation, "__args__", ())) if isinstance(one, type) and issubclass(one, BaseModel)
+    ]
     return found[0] if found and not hasattr(annotation, "__origin__") else None
 
 
 def _files_of(table):
     needed = NEEDED.get(table, {})
-    beside = RIG if table in ("plant", "valves", "pressures", "inclinometer", "controller", "monitor", "shadow") else {"name": "x"}
+    beside = (
+        RIG if table in ("plant", "valves", "pressures", "inclinometer", "controller", "monitor", "shadow") else {"name": "x"}
+    )
     values = _model_of(Bench.model_fields[table].annotation)(**needed).model_dump(mode="json", exclude_none=True)
     return [tomlkit.dumps(beside | {table: needed | {name: value}}).encode() for name, value in values.items()]
 
 
 def parameter_files():
-    """Single tables, which are read before one hears that others are missing; whole files without a word too much; shipped ones."""
+    """Single tables, which are read before one hears that others are missing; whole files, short; the shipped one."""
     tables = load_parameters(shipped()).model_dump(exclude_none=True)
     single = [f'name="x"\n{_table(name, values)}' for name, values in tables.items() if name != "name"]
     whole = 'name="x"\n' + "".join(_table(name, values) for name, values in tables.items() if name != "name")
@@ -72,7 +80,10 @@ def log_files(folder):
     """Small logs of two channels, finished and cut off, in two chunks and in one; and, one in fifty, logs of all channels."""
     small = [_small_log(finish, size) for finish in (True, False) for size in (1200, 4000)]
     made = list(synthetic.messages(0.02))
-    whole = [synthetic.write_log(folder / "seed.mcap", made, finish=f, chunk_bytes=n).read_bytes() for f, n in ((True, 600), (False, 4000))]
+    whole = [
+        synthetic.write_log(folder / "seed.mcap", made, finish=f, chunk_bytes=n).read_bytes()
+        for f, n in ((True, 600), (False, 4000))
+    ]
     return small * 25 + whole
 
 

@@ -89,7 +89,16 @@ def recorder(site, run_dir, limit_bytes=0, within=()):
     Its run directory is there already. What it says stands in `said.txt` there. `within`: the command that starts it elsewhere.
     """
     name, said = run_dir.name, run_dir / "said.txt"
-    command = [*within, sys.executable, "-m", "tests.campaigns.recorder_node", site.endpoint, str(run_dir), name, str(limit_bytes)]
+    command = [
+        *within,
+        sys.executable,
+        "-m",
+        "tests.campaigns.recorder_node",
+        site.endpoint,
+        str(run_dir),
+        name,
+        str(limit_bytes),
+    ]
     with said.open("w") as stderr:
         child = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=stderr)  # stdin: its lifeline
     try:

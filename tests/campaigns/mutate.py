@@ -50,9 +50,7 @@ TARGETS = {
             "command_reason", "take_command", "driver_now", "condition", "arm_is_new", "change_state", "vent_output", "limited",
             "gate_step",
         ),
-        (
-            "tests/devices/test_gate_edges.py", "tests/devices/test_gate.py", "tests/devices/test_gate_sequences.py", "-k", _QUICK,
-        ),
+        (*(f"tests/devices/test_gate{part}.py" for part in ("_edges", "", "_sequences")), "-k", _QUICK),
     ),
     "watchdog": Target(
         "softloop.plant.electrical",

@@ -41,11 +41,9 @@ class Outcome:
         self.failures.append(text)
 
     def as_dict(self):
-        took_s = round(time.monotonic() - self._began, 1)
-        ended = self.ended or "running"
-        return {
-            "campaign": self.name, "ended": ended, **self._code, "counts": self.counts, "failures": self.failures, "took_s": took_s,
-        }  # fmt: skip
+        found = {"campaign": self.name, "ended": self.ended or "running", **self._code}
+        found |= {"counts": self.counts, "failures": self.failures}
+        return found | {"took_s": round(time.monotonic() - self._began, 1)}
 
     def save(self):
         """Write the JSON; whoever reads it meets the old one or the new one, never half of it."""

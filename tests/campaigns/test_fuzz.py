@@ -2,7 +2,12 @@
 
 import pytest
 
+from softloop.deploy.bench import load_bench
+from softloop.dynamics.parameters import load_parameters
+from softloop.offline.log import open_log
+from softloop.wire.errors import SoftloopError
 from tests.campaigns.fuzz import BYTES, campaign
+from tests.campaigns.fuzz_corpora import bench_files, log_files, parameter_files
 
 
 @pytest.mark.parametrize("target", [*BYTES, "gate"])
@@ -10,3 +15,23 @@ def test_a_hundredth_of_the_fuzz_campaign(target):
     outcome = campaign([target], 10_000, "own", seed=5)
     assert outcome.failures == []
     assert sum(outcome.counts.values()) >= 10_000 * (0.5 if target == "gate" else 1.0)
+
+
+def test_the_inputs_that_others_are_made_of_are_good(tmp_path):
+    """Of what is refused in its first line no change would show anything."""
+
+    def taken(read, contents):
+        file, good = tmp_path / "file", 0
+        for content in contents:
+            file.write_bytes(content)
+            try:
+                good += read(file) is not None
+            except SoftloopError as error:
+                assert "valid TOML" not in str(error), content
+        return good
+
+    benches, files = bench_files(tmp_path), parameter_files()
+    assert taken(load_bench, benches) > 0.9 * len(benches) > 100
+    assert taken(load_parameters, files) == 3  # the others are tables of it
+    logs = set(log_files(tmp_path))
+    assert taken(open_log, logs) == len(logs) == 6

@@ -61,7 +61,10 @@ def test_an_interrupted_campaign_says_what_it_counted_and_goes_on_from_there(toy
 
 def test_counts_of_other_code_are_not_gone_on_from(toy):
     start, file = toy
-    assert finish(start("--resume")) == (3, f"toy: {file}: no counts to go on from: [Errno 2] No such file or directory: '{file}'")
+    assert finish(start("--resume")) == (
+        3,
+        f"toy: {file}: no counts to go on from: [Errno 2] No such file or directory: '{file}'",
+    )
     assert finish(start())[0] == 0
     file.write_text(file.read_text().replace('"commit": "', '"commit": "0'))
     code, word = finish(start("--resume", "--items", 12))

@@ -136,7 +136,15 @@ def test_the_charge_current_is_held_only_while_the_exhaust_is_above_the_overlap(
 
 @pytest.mark.parametrize(
     ("asked", "sent", "passed"),
-    [(50.0, 50.0, 50.0), (90.0, 50.0, 80.0), (10.0, 50.0, 20.0), (0.0, 10.0, 0.0), (-5.0, 10.0, 0.0), (300.0, 210.0, 220.0), (0.5, 0.0, 0.5)],
+    [
+        (50.0, 50.0, 50.0),
+        (90.0, 50.0, 80.0),
+        (10.0, 50.0, 20.0),
+        (0.0, 10.0, 0.0),
+        (-5.0, 10.0, 0.0),
+        (300.0, 210.0, 220.0),
+        (0.5, 0.0, 0.5),
+    ],
 )
 def test_a_current_is_within_its_range_and_within_a_steps_change(asked, sent, passed):
     assert g.limited(asked, sent, 30.0, 220.0) == passed
