@@ -14,14 +14,14 @@ from softloop.wire.messages import message
 from tests.offline import synthetic
 
 # The least that the tables of processes ask for beside themselves.
-RIG = {"name": "x", "can": {"can0": {}}, "valves": {}, "pressures": {}, "inclinometer": {"port": "x"}}
+RIG = {"name": "x", "can": {"can0": {}}, "valves": {}, "pressures": {}, "inclinometer": {"port": "x"}, "controller": {}}
 NEEDED = {"inclinometer": {"port": "x"}, "calibration": {"tank_ml": 100.0}}
 MORE_BENCHES = (
     b'base = "base.toml"\nwithout = ["run"]\n[recorder]\n',
     b'base = "base.toml"\npieces = ["piece.toml"]\n',
     b'name = "x"\n[[faults.injections]]\nkind = "zenoh_drop"\ntarget = "command"\nat_s = 2.0\nprobability = 0.5\n',
-    b'name = "x"\n[plant]\n[[plant.faults]]\nkind = "chamber_bias"\non_s = 1\noff_s = 2\nsize = 3\n',
-    b'name = "x"\n[hosts.a]\naddress = "10.0.0.1"\n[hosts.b]\n[plant]\nhost = "a"\n',
+    b'name = "x"\n[can.can0]\n[plant]\n[[plant.faults]]\nkind = "chamber_bias"\non_s = 1\noff_s = 2\nsize = 3\n',
+    b'name = "x"\n[hosts.a]\naddress = "10.0.0.1"\n[recorder]\nhost = "a"\n',
     b'name = "x"\n[zenoh]\nmode = "client"\nendpoint = "tls/10.0.0.1:7447"\n[zenoh.tls]\nfolder = "keys"\n',
 )
 EVIDENCE = '[evidence]\nrig="r"\nmethod="m"\nsoftloop="0"\nparameters=["a0"]\ncovariance=[[1.0]]\n[[evidence.runs]]\nname="a"\n'
@@ -32,11 +32,14 @@ def bench_files(folder):
     """A file for each key of each table, by its default value; the tables in other forms; and those that come with softloop."""
     (folder / "base.toml").write_text('name = "b"\n[run]\narm = false\n[monitor]\n[controller]\n')
     (folder / "piece.toml").write_text("[controller]\napproach_s = 2.0\n")
+    shipped_ones = {path.name: path.read_bytes() for path in shipped_benches().values()}
+    for name, content in shipped_ones.items():  # bases of each other
+        (folder / name).write_bytes(content)
     tables = [name for name, field in Bench.model_fields.items() if _model_of(field.annotation) is not None]
     return [
         *(text for name in tables for text in _files_of(name)),
         *MORE_BENCHES,
-        *(p.read_bytes() for p in shipped_benches().values()),
+        *shipped_ones.values(),
     ]
 
 
