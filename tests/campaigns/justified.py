@@ -11,6 +11,10 @@ JUSTIFIED = {
             "On arming, too, the venting would begin anew; but while armed nothing reads it, and every way out of ARMED sets "
             "both of its fields again."
         ),
+        "vent_output: if state.venting == 1 and (empty or (given.now_ns - state.vent_since_ns >= config.vent_time_ns and "
+        "(not high))): -> if empty or (given.now_ns - state.vent_since_ns >= config.vent_time_ns and (not high)):": (
+            "The branch does nothing but end the venting: where there is none, it ends none."
+        ),
     },
     "watchdog": {
         "accept_command: if driver.waiting > 0: -> if driver.waiting >= 0:": (

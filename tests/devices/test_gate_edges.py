@@ -73,6 +73,22 @@ def test_a_pressure_that_is_none_leaves_the_last_one_standing(bad):
     assert outputs == [g.OUTPUT_VENT] * 4 + [g.OUTPUT_CLOSED]
 
 
+def test_a_fault_long_after_arming_vents_for_its_whole_time():
+    """The pressure that is left is between the one that ends venting and the one that keeps it up."""
+    bench = GateBench(vent_time_s=1.0).armed()
+    for _ in range(300):
+        assert bench.tick().gate == g.GATE_ARMED
+    left = {"chamber_pressure_kpa": 5.0}
+    outputs = [int(bench.tick(stop=1, **left).output)] + [int(bench.tick(**left).output) for _ in range(201)]
+    assert outputs == [g.OUTPUT_VENT] * 200 + [g.OUTPUT_CLOSED] * 2
+
+
+def test_a_pressure_heard_long_ago_does_not_keep_the_venting_up():
+    bench = GateBench(vent_time_s=1.0)
+    outputs = [int(bench.tick(chamber_pressure_kpa=50.0).output)] + [int(bench.tick(command=False).output) for _ in range(201)]
+    assert outputs == [g.OUTPUT_VENT] * 200 + [g.OUTPUT_CLOSED] * 2
+
+
 def request(bench, origin, seq, **fields):
     return bench.tick(arm=1, arm_origin=origin, arm_seq=seq, **fields)
 
