@@ -1,10 +1,10 @@
 """The offset between two clocks from exchanges over a network, with a bound on its error. Pure: no clock is read here.
 
-An exchange is NTP's: asked at t1 and answered at t4 by the own clock, heard at t2 and replied at t3 by the reference clock. Both
-ways take some time that is not known, but neither takes less than none, so the true offset lies within half the round trip of
-the middle, however unequal the two ways are; and how far the clocks can have run apart since comes on top. What is known is the
-range that lies within the bounds of all of the last exchanges: two of which one waited on its way there, the other on its way back,
-say more together than each alone.
+An exchange is NTP's: asked at t1 and answered at t4 by the own clock, heard at t2 and replied at t3 by the reference clock.
+Both ways take some time that is not known, but neither takes less than none, so the true offset lies within half the round
+trip of the middle, however unequal the two ways are; how far the clocks can have run apart since comes on top. What is known
+is the range within the bounds of all of the last exchanges: one that waited on its way there and one on its way back say more
+together than each alone.
 """
 
 from __future__ import annotations

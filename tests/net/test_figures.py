@@ -55,7 +55,8 @@ def test_what_is_wrong_is_said(wrong, word):
 
 
 @pytest.mark.parametrize(
-    ("loss", "off_ms", "good"), [(0.05, 3.0, True), (0.05, 12.4, True), (0.05, 12.5, False), (0.05, float("inf"), False), (0.0, 3.0, False)]
+    ("loss", "off_ms", "good"),
+    [(0.05, 3.0, True), (0.05, 12.4, True), (0.05, 12.5, False), (0.05, float("inf"), False), (0.0, 3.0, False)],
 )
 def test_a_vent_is_an_answer_to_loss_alone_and_must_come_at_once(loss, off_ms, good):
     vented = cell(loss=loss, codes=1, gate_faults=1, off_ms=off_ms, truth_error_max_deg=None)
