@@ -34,7 +34,8 @@ def log():
 
 
 def test_it_says_what_a_shadow_says_that_hears_the_messages_live(log):
-    live, kinds = Shadow(process(seed=2)), {"valves": "ValveStatus", "pressure": "PressureSample", "inclination": "InclinationSample"}
+    live = Shadow(process(seed=2))
+    kinds = {"valves": "ValveStatus", "pressure": "PressureSample", "inclination": "InclinationSample"}
     heard = [(name, message(kind).Tuple(*one.tolist())) for name, kind in kinds.items() for one in log[name]]
     for name, sample in heard:
         live.put(name, sample)
