@@ -33,6 +33,7 @@ from tests.campaigns.kill_rig import (
     recorder,
     recovered,
     waited_s,
+    watched,
 )
 from tests.campaigns.outcome import Outcome, carried_out, options, steps
 
@@ -47,7 +48,7 @@ def kill_once(outcome, rng, site, number):
         alive_ns = time.monotonic_ns() + 200_000_000
         time.sleep(max(0.0, life_s - 1.0))
         waited_before_s = waited_s(child.pid)
-        time.sleep(min(1.0, life_s))
+        did = watched(child.pid, min(1.0, life_s))
         waiting_ms = 1e3 * (waited_s(child.pid) - waited_before_s)
         killed_ns = time.monotonic_ns()
         child.send_signal(signal.SIGKILL)
@@ -62,7 +63,7 @@ def kill_once(outcome, rng, site, number):
     if missing:
         outcome.fail(
             f"kill {number}, {(killed_ns - alive_ns) / 1e9:.2f} s after its start: {missing} messages are missing; the log ends "
-            f"{lost_ms:.0f} ms before the kill, and in its last second the recorder waited {waiting_ms:.0f} ms for a processor"
+            f"{lost_ms:.0f} ms before the kill; in its last second the recorder waited {waiting_ms:.0f} ms for a processor; {did}"
         )
     shutil.rmtree(run_dir)
 

@@ -7,6 +7,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -154,3 +155,16 @@ def waited_s(pid):
         return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) * 1e-9
     except (OSError, ValueError, IndexError):
         return 0.0
+
+
+def watched(pid, seconds):
+    """Look at a process's main thread for so long: what it did at how many looks (its state, and the system call it was in)."""
+    seen, end = Counter(), time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        time.sleep(min(left, 0.05))
+        try:
+            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+            seen[f"{state} in call {Path(f'/proc/{pid}/syscall').read_text().split()[0]}"] += 1
+        except OSError:  # the kernel does not say
+            seen["unknown"] += 1
+    return ", ".join(f"{count} times {what}" for what, count in seen.most_common(4))

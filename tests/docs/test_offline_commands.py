@@ -23,7 +23,15 @@ pytestmark = pytest.mark.commands
 
 LIMIT_S = 400.0
 EXPERIMENT = ("experiment", "pressure")
-STANDS_FOR = {"BENCH": "sim", "RUN...": "runs/p/excitation_1hz", "100:120": "100:101", "200": "2", "0:3": "0:1", "3": "1", "smc,arc_eso": "smc"}
+STANDS_FOR = {
+    "BENCH": "sim",
+    "RUN...": "runs/p/excitation_1hz",
+    "100:120": "100:101",
+    "200": "2",
+    "0:3": "0:1",
+    "3": "1",
+    "smc,arc_eso": "smc",
+}
 FIRST = [*EXPERIMENT, "sim", "--pace", "batch", "--out", "runs/p"]
 ORDER = ("experiments.md", "identification.md", "parity.md", "tracking.md", "real-rig.md")
 
