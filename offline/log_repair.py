@@ -18,7 +18,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 
 from softloop.offline.log import DAMAGE, decompress, find_messages
-from softloop.offline.mcap_walk import RECORD, FileRecords
+from softloop.offline.mcap_walk import RECORD, FileRecords, holds_chunk_mark
 from softloop.wire.errors import BadFile, Unavailable
 from softloop.wire.log_parts import parts_of
 from softloop.wire.mcap_chunks import MAGIC, ChunkedWriter
@@ -141,23 +141,23 @@ class _Descriptions:
         }
 
     def _header(self, body: bytes) -> None:
-        self.header = Header.read(_stream(body))
+        self.header = Header.read(_words(body))
 
     def _schema(self, body: bytes) -> None:
-        schema = Schema.read(_stream(body))
+        schema = Schema.read(_words(body))
         self.schemas.setdefault(schema.id, schema)
 
     def _channel(self, body: bytes) -> None:
-        channel = Channel.read(_stream(body))
+        channel = Channel.read(_words(body))
         self.channels.setdefault(channel.id, channel)
 
     def _chunk(self, body: bytes) -> None:
         for opcode, content in _records_of_chunk(body):
             if opcode == Opcode.SCHEMA:
-                schema = Schema.read(_stream(content))
+                schema = Schema.read(_words(content))
                 self.schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
-                channel = Channel.read(_stream(content))
+                channel = Channel.read(_words(content))
                 self.channels[channel.id] = channel
 
 
@@ -213,7 +213,7 @@ class _Rewriter:
             self.found.attachments += 1
 
     def _metadata(self, body: bytes) -> None:
-        metadata = Metadata.read(_stream(body))
+        metadata = Metadata.read(_words(body))
         if metadata.name not in self._described:
             self._described.add(metadata.name)
             self.writer.add_metadata(metadata.name, metadata.metadata)
@@ -245,6 +245,13 @@ def _records_of_chunk(body: bytes) -> Iterator[tuple[int, bytes]]:
         raise ValueError("its records do not fit its size")
     for opcode, _, start, length in found[:count].tolist():
         yield opcode, data[start : start + length]
+
+
+def _words(body: bytes) -> ReadDataStream:
+    """A description, which goes into the new file as it is. Raises ValueError when a reader would take part of it for a chunk."""
+    if holds_chunk_mark(body):
+        raise ValueError("a chunk begins in it")
+    return _stream(body)
 
 
 def _stream(body: bytes) -> ReadDataStream:

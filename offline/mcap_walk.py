@@ -73,6 +73,11 @@ class FileRecords:
             self.at = found
 
 
+def holds_chunk_mark(data: bytes) -> bool:
+    """Whether there is what a chunk is known by. In a description it is damage: a walk would look for a chunk there."""
+    return any(struct.pack("<I", len(name)) + name in data for name in _COMPRESSIONS)
+
+
 def next_chunk(view: memoryview, start: int, end: int | None = None) -> int:
     """Offset of the first chunk record that begins in [start, end), known by its header; -1 when there is none."""
     end = len(view) if end is None else end

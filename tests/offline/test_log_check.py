@@ -153,3 +153,18 @@ def test_the_commands_and_their_exit_codes(tmp_path, made, capsys):
     assert "nothing to repair" in capsys.readouterr().out
     assert command("repair", run, "-o", tmp_path / "good.mcap") == 3
     assert command("check", tmp_path / "none") == 2
+
+
+def test_a_chunk_amid_the_words_of_a_schema_is_not_taken_into_the_repaired_file(tmp_path, made):
+    """Else that file would look damaged itself, and be read at the chunk that is none."""
+    file = synthetic.write_log(tmp_path / "run.mcap", made[:40], chunk_bytes=600)
+    content = bytearray(file.read_bytes())
+    records = [(opcode, at, len(body)) for opcode, at, body in FileRecords(memoryview(content))]
+    size, chunk = min((n + 9, at) for opcode, at, n in records if opcode == 6)
+    schema = next(at for opcode, at, n in records if opcode == 3 and n > size + 200)
+    content[schema + 100 : schema + 100 + size] = content[chunk : chunk + size]
+    file.write_bytes(content)
+    assert open_log(file).problems
+    again = open_log(repair_log(file, tmp_path / "good.mcap").file)
+    assert again.problems == []
+    assert again.channels
