@@ -163,6 +163,7 @@ def test_a_chunk_amid_the_words_of_a_schema_is_not_taken_into_the_repaired_file(
     size, chunk = min((n + 9, at) for opcode, at, n in records if opcode == 6)
     schema = next(at for opcode, at, n in records if opcode == 3 and n > size + 200)
     content[schema + 100 : schema + 100 + size] = content[chunk : chunk + size]
+    content[next(at for opcode, at, _ in records if opcode == 6) + 100] ^= 255  # with the schemas' second copies
     file.write_bytes(content)
     assert open_log(file).problems
     again = open_log(repair_log(file, tmp_path / "good.mcap").file)
