@@ -86,7 +86,7 @@ def test_bootstrap_is_repeatable_and_of_the_size_of_the_others():
     first, again, other = (of_fit(fit, [data], "bootstrap", seed) for seed in (1, 1, 2))
     assert (first.covariance == again.covariance).all()
     assert not (first.covariance == other.covariance).all()
-    assert first.degrees == 6.0  # of seven blocks of ten seconds
+    assert first.degrees == BLOCKS_LEAST - 1
     ratio = first.errors / of_fit(fit, [data], "white").errors
     assert ((ratio > 0.2) & (ratio < 5.0)).all()
 
