@@ -202,7 +202,7 @@ def solve(problem: Problem, values: Floats, starts: Floats, iterations: int = 60
 
 @dataclass(frozen=True)
 class _Beginning:
-    """Angle and rate (2,) that the first samples show, and the weights (2,) that these samples give them."""
+    """Angle and rate (2,) that the first samples show, and the weights (2,) of those among them that do not count."""
 
     state: Floats
     weight: Floats
@@ -221,7 +221,8 @@ def _beginning(experiment: Series) -> _Beginning:
     still = int(np.argmax(moved.any(axis=1))) if moved.any() else len(moved)
     count = max(still, FIRST_SAMPLES)
     time_s, angle = experiment.time_s[:count] - experiment.time_s[0], experiment.angle_deg[:count]
-    weight = np.sqrt([count, np.sum((time_s - time_s.mean()) ** 2)])
+    alone = ~experiment.counted[:count]  # the others are compared with the simulation as it is
+    weight = np.sqrt([alone.sum(), np.sum((time_s[alone] - time_s.mean()) ** 2)])
     if still > FIRST_SAMPLES:
         return _Beginning(np.array([np.mean(angle), 0.0]), weight)
     rate, level = np.polyfit(time_s, angle, 1)
