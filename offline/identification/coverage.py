@@ -150,7 +150,7 @@ class RigTally:
             step(repeat)
             data1, _ = halves(excite(FAST, PlantConfig(layer="rig", seed=seed), 1000 * seed + repeat))
             fit = fit_output_error(PAPER, [data1])
-            found.append(_Repeat(fit.values[:-2], {m: _Held.of(of_fit(fit, [data1], m, repeat + 1)) for m in RIG_METHODS}))
+            found.append(_Repeat(fit.values[:-2], {m: _Held.of(of_fit(fit, [data1], m)) for m in RIG_METHODS}))
         self._rigs.append(found)
 
     def counted(self) -> dict[str, Any]:

@@ -7,6 +7,7 @@
   autoregressive model; of output error's, the smoothed spectrum: their white noise of the angle hides the slow noise that went
   through the actuator from an autoregressive model of few terms, and it is the slow part that moves the parameters.
 - `bootstrap`: blocks of the experiment are drawn anew; takes what the model leaves out, as far as it forgets within a block.
+  Where the excitation repeats itself, so do the errors of structure, and periods are no new blocks.
 - `between`: several experiments, each fitted on its own; takes everything that differs between them.
 """
 
@@ -30,7 +31,7 @@ Indices = NDArray[np.int64]
 LEVEL = 0.95
 ORDER_MOST = 40  # of the autoregressive model
 BLOCK_S, BLOCKS_LEAST = 10.0, 4
-DRAWS = 400
+LEFT_LEAST = 0.01  # of a block's residuals, left by the fit: a direction that one block alone shows has none
 DIFFERENT, ALIKE = 0.5, 0.99  # correlations of the pressure: with what it is not, with what it is a period later
 SMOOTH_BINS = 20  # of the spectrum, to either side: far more than the unknowns, which take their own share of the residuals away
 MOVED = 1e-2  # a direction without information moves an unknown when it has this part of it
@@ -77,14 +78,14 @@ def sensitivities(fit: Fit, experiments: list[Series]) -> tuple[Floats, list[Flo
     return scale, np.split(residuals, ends)[:-1], np.split(jacobian, ends)[:-1]
 
 
-def of_fit(fit: Fit, experiments: list[Series], method: str, seed: int = 1) -> Uncertainty:
+def of_fit(fit: Fit, experiments: list[Series], method: str) -> Uncertainty:
     """Uncertainty of an output error fit by `white`, `coloured` or `bootstrap`."""
     scale, residuals, jacobians = sensitivities(fit, experiments)
     names = [n for n in fit.structure.names if not (fit.structure.at_rest and n == "d")]
     kept = len(names)
     degrees = np.inf
     if method == "bootstrap":
-        covariance, degrees = bootstrap(residuals, jacobians, [blocks_of(e) for e in experiments], seed)
+        covariance, degrees = bootstrap(residuals, jacobians, [blocks_of(e) for e in experiments])
     else:
         gain = _damped_inverse(np.sum([j.T @ j for j in jacobians], axis=0))
         pairs = zip(residuals, jacobians, strict=True)
@@ -167,22 +168,26 @@ def autoregressive(error: Floats, most: int = ORDER_MOST) -> tuple[Floats, float
     return best[1], best[2]
 
 
-def bootstrap(residuals: list[Floats], jacobians: list[Floats], blocks: list[list[Indices]], seed: int) -> tuple[Floats, float]:
-    """Covariance of the unknowns over DRAWS resamplings of blocks, one Gauss-Newton step each, and its degrees of freedom.
+def bootstrap(residuals: list[Floats], jacobians: list[Floats], blocks: list[list[Indices]]) -> tuple[Floats, float]:
+    """Covariance of the unknowns over blocks drawn anew, one Gauss-Newton step each, and its degrees of freedom.
 
-    The blocks of all experiments, `blocks_of` each, are drawn together. With few blocks the spread is itself uncertain; Student's
-    t says so.
+    It is what draws with independent weights of mean and variance 1 come to when there are very many of them, so that none need be
+    made. Of each block's residuals the fit has taken away a share, the more the fewer blocks there are; they are made larger by
+    as much (Bell and McCaffrey, 2002). With few blocks the spread is itself uncertain; Student's t says so. The blocks of all
+    experiments, `blocks_of` each, count together.
     """
-    scores, squares = [], []
-    for r, j, own in zip(residuals, jacobians, blocks, strict=True):
-        scores += [j[rows].T @ r[rows] for rows in own]
-        squares += [j[rows].T @ j[rows] for rows in own]
-    score, square, count = np.array(scores), np.array(squares), len(scores)
-    random = np.random.RandomState(seed)  # its stream is frozen by numpy's policy
-    weights = random.multinomial(count, np.full(count, 1.0 / count), DRAWS).astype(float)
-    steps = [-_damped_inverse(np.tensordot(w, square, 1)) @ (w @ score) for w in weights]
-    covariance = np.cov(np.array(steps), rowvar=False) * count / (count - 1.0)
-    return covariance, float(count - 1)
+    pairs = [(j[rows], r[rows]) for r, j, own in zip(residuals, jacobians, blocks, strict=True) for rows in own]
+    squares = [j.T @ j for j, _ in pairs]
+    size = np.sqrt(np.maximum(np.diag(np.sum(squares, axis=0)), 1e-300))
+    values, vectors = np.linalg.eigh(np.sum(squares, axis=0) / np.outer(size, size))
+    root = vectors * np.where(values > 1e-13 * values[-1], 1.0 / np.sqrt(np.maximum(values, 1e-300)), 0.0) @ vectors.T / size
+    steps = []
+    for (j, r), square in zip(pairs, squares, strict=True):
+        taken, turned = np.linalg.eigh(root @ square @ root.T)
+        left = turned / np.sqrt(np.maximum(1.0 - taken, LEFT_LEAST)) @ turned.T
+        steps.append(root.T @ left @ root @ (j.T @ r))
+    found = np.array(steps)
+    return found.T @ found, float(len(steps) - 1)
 
 
 def blocks_of(experiment: Series, block_s: float = BLOCK_S) -> list[Indices]:
