@@ -168,7 +168,9 @@ def coverage(
 @app.command()
 def fits(
     seeds: Annotated[str, typer.Option(metavar="FIRST:END", help="Rigs, by seed; END is not among them.")] = "0:20",
-    hysteresis: Annotated[int | None, typer.Option(min=0, max=4, metavar="N", help="Bouc-Wen elements; default: the recommended.")] = None,
+    hysteresis: Annotated[
+        int | None, typer.Option(min=0, max=4, metavar="N", help="Bouc-Wen elements; default: the recommended.")
+    ] = None,
     creep: Annotated[int | None, typer.Option(min=0, max=4, metavar="N", help="Creep terms; default: the recommended.")] = None,
     output: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Write what was found, after each rig.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,

@@ -8,8 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from softloop.deploy.experiment_pressure import RUNS
 from softloop.deploy.experiment_pressure import judge as judge_pressure
 from softloop.deploy.experiment_tracking import RESULT as TRACKING

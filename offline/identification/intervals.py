@@ -171,10 +171,10 @@ def autoregressive(error: Floats, most: int = ORDER_MOST) -> tuple[Floats, float
 def bootstrap(residuals: list[Floats], jacobians: list[Floats], blocks: list[list[Indices]]) -> tuple[Floats, float]:
     """Covariance of the unknowns over blocks drawn anew, one Gauss-Newton step each, and its degrees of freedom.
 
-    It is what draws with independent weights of mean and variance 1 come to when there are very many of them, so that none need be
-    made. Of each block's residuals the fit has taken away a share, the more the fewer blocks there are; they are made larger by
-    as much (Bell and McCaffrey, 2002). With few blocks the spread is itself uncertain; Student's t says so. The blocks of all
-    experiments, `blocks_of` each, count together.
+    It is what draws with independent weights of mean and variance 1 come to when there are very many of them, so that none has
+    to be made. Of each block's residuals the fit has taken away a share, the more the fewer blocks there are; they are made
+    larger by as much (Bell and McCaffrey, 2002). With few blocks the spread is itself uncertain; Student's t says so. The blocks
+    of all experiments, `blocks_of` each, count together.
     """
     pairs = [(j[rows], r[rows]) for r, j, own in zip(residuals, jacobians, blocks, strict=True) for rows in own]
     squares = [j.T @ j for j, _ in pairs]
