@@ -58,6 +58,18 @@ def parity(
     return judge_parity(run_a, run_b, bounds, out, as_json=as_json)
 
 
+@app.command(epilog=EXIT_CODES)
+def shadow(
+    bench: Annotated[Path, typer.Argument(metavar="BENCH", help="With a table [shadow]: the plant that is to follow.")],
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A directory, or a log in it.")],
+    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON, every word of the shadow.")] = False,
+) -> int:
+    """Let the simulated plant of a bench follow a log on its valve currents, and say how far the two were apart."""
+    from softloop.deploy.follow_log import follow_run
+
+    return follow_run(bench, run, as_json=as_json)
+
+
 @app.command()
 def tune(
     law: Annotated[str, typer.Argument(metavar="LAW", help="pid, pid_eso, smc, arc or arc_eso.")],

@@ -203,8 +203,8 @@ def add_other(sections: Sections, numbers: Numbers, folder: Path) -> None:
     )
     section = Section("Another rig: on Table 1, and on parameters identified from its own logs", lead)
     note = (
-        "smc and arc size their robust terms by the parameters' bounds (Eqs. 38 and 47). Here these are three standard errors of "
-        "one experiment, in c2 and c3 far wider than Table 1's: smc, which learns nothing, then asks for more than valves can do."
+        "smc and arc size their robust terms by the parameters' bounds (Eqs. 38 and 47). The identified ones are wide enough for "
+        "what the parameters do together, three standard errors of the acceleration, and not of each parameter alone."
     )
     section.parts.append(TableOf("Error, true angle less reference, deg", heads, tuple(rows), note))
     sections.append(section)
@@ -248,16 +248,17 @@ def add_coverage(sections: Sections, numbers: Numbers, counted: Path | None) -> 
     found = json.loads(counted.read_text(encoding="utf-8"))
     numbers["coverage"] = found
     source = f"seeds {found['first_seed']}:{found['first_seed'] + found['rigs']}, in one process"
+    methods = found["methods"]
     rows = []
-    for method, by_name in found["methods"].items():
-        cells = (f"{100 * row['held']:.1f} ({100 * row['low']:.1f} to {100 * row['high']:.1f})" for row in by_name.values())
-        rows.append(Row((method, *cells), source, link=False))
-    names = tuple(next(iter(found["methods"].values())))
+    for name in next(iter(methods.values())):
+        counts = (by_name[name] for by_name in methods.values())
+        cells = (f"{100 * row['held']:.1f} ({100 * row['low']:.1f} to {100 * row['high']:.1f})" for row in counts)
+        rows.append(Row((name, *cells), source, link=False))
     section = Section(
         "Coverage",
         f"{found['rigs']} ideal rigs: the share of 95 % intervals that hold the true value, %, with its binomial interval.",
     )
-    section.parts.append(TableOf("Held, %", ("method, residuals taken for", *names), tuple(rows)))
+    section.parts.append(TableOf("Held, %", ("parameter", *methods), tuple(rows)))
     sections.append(section)
 
 

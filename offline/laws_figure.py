@@ -22,11 +22,12 @@ def figure_67(logs: Mapping[str, Log], law: str) -> Figure:
         figure, axes = make_figure(9.0, 4, sharex=True, height_ratios=(3.0, 1.0, 2.4, 2.0))
         for number, (name, log) in enumerate(logs.items()):
             _draw_law(axes, name, log, COLORS[number % len(COLORS)], first=number == 0)
+        against = dict.fromkeys(errors_of(log)[1] for log in logs.values())
         cycles = metrics.tracked(logs[law])
         start_ns = int(cycles["stamp_ns"][0]) if len(cycles) else 0
         _draw_modes(axes[1], cycles, start_ns)
         _draw_currents(axes[3], cycles, start_ns)
-        axes[0].set_title("(a)  Trajectory tracking")
+        axes[0].set_title(f"(a)  Trajectory tracking, {' and '.join(against)}")
         axes[1].set_title(f"(b)  Control modes of {law}")
         axes[2].set_title("(c)  Tracking error")
         axes[3].set_title(f"(d)  Control inputs of {law}")
@@ -40,7 +41,7 @@ def figure_67(logs: Mapping[str, Log], law: str) -> Figure:
 
 
 def _draw_law(axes: list[Axes], name: str, log: Log, color: Any, *, first: bool) -> None:
-    errors, against = errors_of(log)
+    errors, _ = errors_of(log)
     cycles = metrics.tracked(log)
     if not len(cycles) or not errors.error_deg.size:
         return
@@ -48,5 +49,5 @@ def _draw_law(axes: list[Axes], name: str, log: Log, color: Any, *, first: bool)
     reference = np.interp(errors.time_s, time_s, cycles["reference_deg"])
     if first:
         axes[0].plot(time_s, cycles["reference_deg"], color=BLACK, linewidth=0.9, linestyle=(0, (4, 2)), label="reference")
-    axes[0].plot(errors.time_s, reference + errors.error_deg, color=color, linewidth=1.0, label=f"{name} ({against})")
+    axes[0].plot(errors.time_s, reference + errors.error_deg, color=color, linewidth=1.0, label=name)
     axes[2].plot(errors.time_s, errors.error_deg, color=color, linewidth=0.8, label=name)

@@ -1,9 +1,10 @@
 """The offset between two clocks from exchanges over a network, with a bound on its error. Pure: no clock is read here.
 
-An exchange is NTP's: asked at t1 and answered at t4 by the own clock, heard at t2 and replied at t3 by the reference clock. Both
-ways take some time that is not known, but neither takes less than none, so the true offset lies within half the round trip of
-the middle, however unequal the two ways are. Of the last exchanges the one counts whose bound is tightest now: half its round
-trip, and how far the clocks can have run apart since.
+An exchange is NTP's: asked at t1 and answered at t4 by the own clock, heard at t2 and replied at t3 by the reference clock.
+Both ways take some time that is not known, but neither takes less than none, so the true offset lies within half the round
+trip of the middle, however unequal the two ways are; how far the clocks can have run apart since comes on top. What is known
+is the range within the bounds of all of the last exchanges: one that waited on its way there and one on its way back say more
+together than each alone.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ RATE_SPAN_NS = 1_000_000_000  # for the clocks' rate, the best exchange of each 
 RATE_SPANS = 64
 # What the middle of an exchange may move by itself where its round trip says that it did not: reading clocks takes time.
 SHIFT_NS = 50_000
-QUICK = 1.5  # times the shortest round trip that is remembered: as good a witness
+QUICK = 1.5  # times the shortest round trip of the last minute: as good a witness
 # What bridges a gap at this rate or less since the last exchange is drift; what does not has jumped.
 PLAUSIBLE_PPM = 2000.0
 READING_NS = 1_000  # two clocks are not read in the very same instant
@@ -52,9 +53,9 @@ class Estimate:
     """What is known of a clock at one time.
 
     Attributes:
-        offset_ns: reference clock less own clock.
+        offset_ns: reference clock less own clock, the middle of the range that it must lie in.
         uncertainty_ns: the true offset is not farther away than this.
-        delay_ns: round trip of the exchange that this rests on.
+        delay_ns: round trip of the exchange that says most by itself.
         drift_ppm: how much faster the reference clock runs; drift_error_ppm is the bound on its error.
     """
 
@@ -100,9 +101,15 @@ class OffsetEstimator:
 
     def at(self, own_ns: int) -> Estimate:
         """What is known at `own_ns`. Needs one exchange at least."""
-        best = self._best(own_ns)
+        low_ns, high_ns = self._range_ns(own_ns)
         drift_ppm, error_ppm = self._drift()
-        return Estimate(best.offset_ns, self._bound_ns(best, own_ns), best.delay_ns, drift_ppm, error_ppm)
+        middle_ns, half_ns = (low_ns + high_ns) // 2, (high_ns - low_ns + 1) // 2
+        return Estimate(middle_ns, half_ns, self._best(own_ns).delay_ns, drift_ppm, error_ppm)
+
+    def _range_ns(self, own_ns: int) -> tuple[int, int]:
+        """Where the true offset lies at `own_ns`, by all exchanges that are remembered; none of them speaks against it."""
+        bounds = [(e.offset_ns, self._bound_ns(e, own_ns)) for e in self._recent]
+        return max(o - b for o, b in bounds), min(o + b for o, b in bounds)
 
     def _best(self, own_ns: int) -> Exchange:
         return min(self._recent, key=lambda e: self._bound_ns(e, own_ns))
@@ -117,18 +124,23 @@ class OffsetEstimator:
     def _check(self, new: Exchange) -> int:
         """Forget what the new exchange speaks against; returns by how much the clock jumped, 0 where it did not."""
         now_ns = new.answered_ns
-        best = self._best(now_ns)
-        apart_ns = new.offset_ns - best.offset_ns
-        gap_ns = abs(apart_ns) - self._bound_ns(best, now_ns) - self._bound_ns(new, now_ns)
+        low_ns, high_ns = self._range_ns(now_ns)
+        bound_ns = self._bound_ns(new, now_ns)
+        gap_ns = max(new.offset_ns - bound_ns - high_ns, low_ns - new.offset_ns - bound_ns)
         if gap_ns > 0:  # both cannot be true of one clock
-            return self._contradicted(new, apart_ns, gap_ns)
-        if self._is_quick(new) and abs(apart_ns) > self._may_shift_ns(best, new):
+            return self._contradicted(new, new.offset_ns - (low_ns + high_ns) // 2, gap_ns)
+        best = self._best(now_ns)
+        if self._is_quick(new) and abs(new.offset_ns - best.offset_ns) > self._may_shift_ns(best, new):
             self._recent.clear()  # both may be true, but either the way or the clock is another now
         return 0
 
     def _is_quick(self, new: Exchange) -> bool:
         """One that waited long knows little: it may not make what is known better forgotten."""
-        return new.delay_ns <= QUICK * min(e.delay_ns for e in self._recent) + SHIFT_NS
+        return new.delay_ns <= QUICK * self._shortest_ns(new) + SHIFT_NS
+
+    def _shortest_ns(self, new: Exchange) -> int:
+        """The shortest round trip of the last minute; in some seconds of a busy machine all may have waited."""
+        return min(e.delay_ns for e in (*self._recent, *self._spans, new))
 
     def _contradicted(self, new: Exchange, apart_ns: int, gap_ns: int) -> int:
         since_ns = max(1, new.answered_ns - self._recent[-1].answered_ns)
@@ -144,7 +156,7 @@ class OffsetEstimator:
 
     def _may_shift_ns(self, best: Exchange, new: Exchange) -> float:
         """How far two middles can be apart on ways whose shortest times stand: what queues add goes to one side only."""
-        shortest_ns = min(e.delay_ns for e in (*self._recent, new))
+        shortest_ns = self._shortest_ns(new)
         queued_ns = (best.delay_ns - shortest_ns + new.delay_ns - shortest_ns) / 2
         return queued_ns + self._moved_ns(best.asked_ns, new.answered_ns) + SHIFT_NS
 

@@ -16,6 +16,8 @@ GOOD = {
     "ticks_skipped": 0,
     "truth_error_max_deg": 1.0,
     "off_ms": None,
+    "was_armed": True,
+    "charge_max_ma": 70.0,
     "pressure_age_p50_ms": 4.0,
     "inclination_age_p50_ms": 3.0,
 }
@@ -53,12 +55,20 @@ def test_what_is_wrong_is_said(wrong, word):
 
 
 @pytest.mark.parametrize(
-    ("loss", "off_ms", "good"), [(0.05, 3.0, True), (0.05, 11.0, False), (0.05, float("inf"), False), (0.0, 3.0, False)]
+    ("loss", "off_ms", "good"),
+    [(0.05, 3.0, True), (0.05, 12.4, True), (0.05, 12.5, False), (0.05, float("inf"), False), (0.0, 3.0, False)],
 )
 def test_a_vent_is_an_answer_to_loss_alone_and_must_come_at_once(loss, off_ms, good):
     vented = cell(loss=loss, codes=1, gate_faults=1, off_ms=off_ms, truth_error_max_deg=None)
     assert vented.outcome == "vented"
     assert (failures(vented) == []) is good
+
+
+@pytest.mark.parametrize(("loss", "charge_max_ma", "good"), [(0.05, 0.4, True), (0.05, 2.0, False), (0.0, 0.4, False)])
+def test_not_to_arm_is_an_answer_to_loss_alone_and_without_current(loss, charge_max_ma, good):
+    refused = cell(loss=loss, codes=1, was_armed=False, charge_max_ma=charge_max_ma, truth_error_max_deg=None)
+    assert refused.outcome == "not armed"
+    assert (failures(refused) == []) is good
 
 
 def test_a_run_without_a_log_fails():
