@@ -11,7 +11,7 @@ SOURCES := wire dynamics devices plant controller watch offline deploy tests ben
 
 CHROMIUM ?= /usr/bin/chromium
 
-.PHONY: help setup demo test exact test-page test-docs test-long test-rerun test-net kill mutate fuzz monitor rearm flood lint lock clean
+.PHONY: help setup demo docs test exact test-page test-docs test-long test-rerun test-net kill mutate fuzz monitor rearm flood lint lock clean
 
 help:
 	@echo 'make demo   set up, then run the two demonstration trajectories on the simulated rig'

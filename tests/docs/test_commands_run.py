@@ -26,6 +26,7 @@ LIMIT_S = 120.0
 STOP = ["request", "sim", "stop"]
 FIRST = ["run", "sim", "--page", "--run-dir", "runs/first"]
 SECOND = ["run", "pid.toml", "--run-dir", "runs/second"]
+OFFLINE = ("experiment", "identify", "valve", "coverage", "fits", "reproduce", "shadow", "evaluate")  # in test_offline_commands.py
 BESIDE = ("top", "echo", "page", "foxglove", "request")
 ON_LOGS = ("plot", "report", "compare", "replay", "keys")
 ELSEWHERE = ("doctor", "install", "log", "parity", "wt931", "canopen", "calibrate")  # in tests of their own
@@ -92,14 +93,14 @@ class Place:
             command, cwd=self.folder, env=self.environment, stdout=output, stderr=output, stdin=subprocess.DEVNULL
         )
 
-    def run(self, words, meanwhile=None):
+    def run(self, words, meanwhile=None, limit_s=LIMIT_S):
         """Carry a command out, `meanwhile` again and again until it has ended; its exit code and what it said."""
         with self.said("done.txt") as (file, output):
             process = self.start(words, output)
             until = time.monotonic() + LIMIT_S
             while meanwhile and process.poll() is None and time.monotonic() < until:
                 end(self.start(meanwhile, subprocess.DEVNULL))
-            return end(process), file.read_text()
+            return end(process, limit_s), file.read_text()
 
     @contextmanager
     def said(self, name):
@@ -121,10 +122,10 @@ class Place:
                 end(process)
 
 
-def end(process):
+def end(process, limit_s=LIMIT_S):
     """The exit code; a process that does not end is killed, and the test fails."""
     try:
-        return process.wait(LIMIT_S)
+        return process.wait(limit_s)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
@@ -187,5 +188,5 @@ def test_on_what_is_there(place, command):
 
 def test_every_command_of_the_pages_is_among_these():
     """A new kind of command on a page is a new line here."""
-    assert {command[0] for _, command in ALL} <= {"run", "batch", "check", "faults", *BESIDE, *ON_LOGS, *ELSEWHERE}
+    assert {command[0] for _, command in ALL} <= {"run", "batch", "check", "faults", *BESIDE, *ON_LOGS, *OFFLINE, *ELSEWHERE}
     assert all(command in [command for _, command in ALL] for command in (FIRST, SECOND, STOP))

@@ -24,12 +24,14 @@ STANDS_FOR = {"runs/first": "first", "runs/second": "second", "runs/RUN": "first
 
 
 def commands_in(page):
-    """The words of each command line in the code blocks of a page."""
-    for block in re.findall(r"^```[a-z]*\n(.*?)^```", page.read_text(), re.S | re.M):
-        for line in block.splitlines():
-            words = line.strip().removeprefix("$ ").removeprefix(".venv/bin/")
-            if words.startswith("softloop ") and ":" not in words.split(" ")[1]:
-                yield shlex.split(words, comments=True)[1:]
+    """The words of each command line in the code blocks of a page, fenced or indented."""
+    text = page.read_text()
+    blocks = re.findall(r"^```[a-z]*\n(.*?)^```", text, re.S | re.M)
+    blocks += re.findall(r"\n\n((?:    .*\n)+)", re.sub(r"^```.*?^```", "", text, flags=re.S | re.M))
+    for line in "".join(blocks).splitlines():
+        words = line.strip().removeprefix("$ ").removeprefix(".venv/bin/")
+        if words.startswith("softloop ") and ":" not in words.split(" ")[1]:
+            yield shlex.split(words, comments=True)[1:]
 
 
 ALL = [(page.name, command) for page in PAGES for command in commands_in(page)]
