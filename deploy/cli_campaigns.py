@@ -168,10 +168,26 @@ def coverage(
     rigs: Annotated[int, typer.Option(min=1, help="How many rigs; on the rig layer each is excited 40 times.")] = 1000,
     layer: Annotated[Literal["ideal", "rig"], typer.Option(help="Rigs that are the model, or that have more than it.")] = "ideal",
     first_seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seeds are N, N+1, ...")] = 1,
-    output: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Write what was counted.")] = None,
+    output: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Write what was counted, as it grows.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
 ) -> int:
     """Count over simulated rigs whether the intervals of each method hold what they say."""
     from softloop.deploy.coverage import coverage as count
 
     return count(layer, rigs, first_seed, output, as_json=as_json)
+
+
+@app.command()
+def fits(
+    seeds: Annotated[str, typer.Option(metavar="FIRST:END", help="Rigs, by seed; END is not among them.")] = "0:20",
+    hysteresis: Annotated[
+        int | None, typer.Option(min=0, max=4, metavar="N", help="Bouc-Wen elements; default: the recommended.")
+    ] = None,
+    creep: Annotated[int | None, typer.Option(min=0, max=4, metavar="N", help="Creep terms; default: the recommended.")] = None,
+    output: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Write what was found, after each rig.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
+) -> int:
+    """Identify simulated rigs from their own Data1, and score the models on Data2 and Data3, which they have not seen."""
+    from softloop.deploy.fits import fits as fit
+
+    return fit(seeds, hysteresis, creep, output, as_json=as_json)

@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
-from softloop.deploy.progress import counted_progress
-from softloop.offline.identification.coverage import count_ideal, count_rig
-from softloop.wire.errors import EXIT_OK, BadFile
+from softloop.deploy.tally import count
+from softloop.offline.identification.coverage import IdealTally, RigTally
+from softloop.wire.errors import EXIT_OK
 
 
 def coverage(layer: str, rigs: int, first_seed: int, output: Path | None, *, as_json: bool) -> int:
-    """Count, show, and write what was counted as JSON. Raises BadFile."""
-    if output and not output.parent.is_dir():
-        raise BadFile(f"{output}: there is no folder {output.parent}")
+    """Count, show, and write what was counted as JSON. Raises BadFile, or Interrupted with what was counted shown."""
+    tally = IdealTally() if layer == "ideal" else RigTally()
     seeds = range(first_seed, first_seed + rigs)
-    with counted_progress("identifying rigs", quiet=as_json) as progress:
-        counted = count_ideal(seeds, progress) if layer == "ideal" else count_rig(seeds, progress)
-    counted = {"layer": layer} | counted
-    text = json.dumps(counted, indent=2)
-    if output:
-        output.write_text(text + "\n", encoding="utf-8")
-    if as_json:
-        print(text)
-    else:
-        _show(counted)
+    says = {"layer": layer, "first_seed": first_seed, "asked_rigs": rigs}
+    count(tally, seeds, "identifying rigs", says, output, _show, as_json=as_json)
     return EXIT_OK
 
 

@@ -31,11 +31,12 @@ from softloop.deploy.experiment_tracking import RESULT as TRACKING
 from softloop.deploy.experiment_tracking import run_tracking
 from softloop.deploy.experiment_valves import RESULT as VALVES
 from softloop.deploy.experiment_valves import SUPPLIES_KPA, run_name, run_valves
+from softloop.deploy.tally import go_over
 from softloop.deploy.tune import seeds_of
 from softloop.offline.evaluation import LAWS, OWN, evaluate, figures
 from softloop.offline.identification.experiments import FAST
 from softloop.offline.identification.intervals import of_fit
-from softloop.offline.reproduction import SLOW, Identified, data_of, fit_over_rigs, identify_all
+from softloop.offline.reproduction import SLOW, FitTally, Identified, data_of, identify_all
 from softloop.offline.reproduction_page import Section, page_of
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig, SoftloopError, Unavailable
 
@@ -145,8 +146,9 @@ def _identified(work: Work, name: str, output: str, what: str, only: str = "") -
 
 def over_seeds(work: Work) -> None:
     """Fits on the rig layer over many rigs."""
-    found = fit_over_rigs(seeds_of(work.wanted.seeds), work.counting("fitting rigs"))
-    sections.add_seeds(work.sections, work.numbers, found, work.wanted.seeds)
+    tally = FitTally()
+    go_over(tally, seeds_of(work.wanted.seeds), work.counting("fitting rigs"))
+    sections.add_seeds(work.sections, work.numbers, tally.counted(), work.wanted.seeds)
 
 
 def valves(work: Work) -> None:

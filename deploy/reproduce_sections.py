@@ -8,8 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from softloop.deploy.experiment_pressure import RUNS
 from softloop.deploy.experiment_pressure import judge as judge_pressure
 from softloop.deploy.experiment_tracking import RESULT as TRACKING
@@ -24,7 +22,7 @@ from softloop.offline.identification.figures import validation
 from softloop.offline.identification.orders import compare
 from softloop.offline.identification.structure import PAPER
 from softloop.offline.laws_figure import figure_67
-from softloop.offline.reproduction import PAPER_FITS, SLOW, Identified, table1
+from softloop.offline.reproduction import MEMORY, PAPER_FITS, SLOW, Identified, table1, words_of
 from softloop.offline.reproduction_page import DASH, LogEntry, Picture, Row, Section, TableOf, figures, number
 from softloop.offline.run_log import find_log, open_run
 from softloop.offline.vector import as_bytes
@@ -212,14 +210,13 @@ def add_other(sections: Sections, numbers: Numbers, folder: Path) -> None:
     sections.append(section)
 
 
-def add_seeds(sections: Sections, numbers: Numbers, found: list[dict[str, Any]], seeds: str) -> None:
-    """Fits over many rigs."""
+def add_seeds(sections: Sections, numbers: Numbers, found: Numbers, seeds: str) -> None:
+    """Fits over many rigs, as `FitTally` counts them."""
     numbers["fits_over_rigs"] = found
     rows = []
-    for key, words in (("oe", "Eq. 2"), ("memory", "Eq. 2 with one Bouc-Wen element and two creep terms")):
-        for data in ("Data2", "Data3"):
-            values = np.array([f[key][data] for f in found])
-            cells = (f"{words}, {data}", number(float(np.median(values))), number(float(values.min())), number(PAPER_FITS[data]))
+    for key, words in (("oe", "Eq. 2"), ("memory", f"Eq. 2 with {words_of(MEMORY)}")):
+        for data, over in found["models"][key].items():
+            cells = (f"{words}, {data}", number(over["median"]), number(over["worst"]), number(PAPER_FITS[data]))
             rows.append(Row(cells, f"seeds {seeds}, in one process", link=False))
     section = Section("Fits over rigs", "Rig layer, each rig drawn by its seed; trained on its Data1.")
     section.parts.append(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,13 @@ PAPER_FITS = {"Data2": 92.8772, "Data3": 90.8123}  # NRMSE fit, %, as printed in
 MEMORY = Structure(hysteresis=1, creep=2)  # the structure that is recommended where an actuator remembers
 DATA = ("Data1", "Data2", "Data3")
 Progress = Callable[[int, int], None]
+_WORDS = ("no", "one", "two", "three", "four")
+
+
+def words_of(memory: Structure) -> str:
+    """How much a structure remembers, in words."""
+    counts = ((memory.hysteresis, "Bouc-Wen element"), (memory.creep, "creep term"))
+    return " and ".join(f"{_WORDS[n] if n < len(_WORDS) else n} {what}{'s' * (n != 1)}" for n, what in counts)
 
 
 @dataclass(frozen=True)
@@ -117,7 +124,7 @@ _METHODS: tuple[tuple[str, str, Callable[[Series], tuple[Fit, Uncertainty | None
     ("ls", "Eq. 2 by least squares, intervals for coloured residuals", _ls),
     ("iv", "Eq. 2 by instrumental variables", _iv),
     ("oe", "Eq. 2 by output error, intervals by block bootstrap", _oe),
-    ("memory", "Eq. 2 with one Bouc-Wen element and two creep terms, output error", _memory),
+    ("memory", f"Eq. 2 with {words_of(MEMORY)}, output error", _memory),
 )
 
 
@@ -128,17 +135,45 @@ def table1() -> dict[str, tuple[float, float, float]]:
     return {name: (e.value, e.min, e.max) for name, e in entries.items()}
 
 
-def fit_over_rigs(seeds: Sequence[int], progress: Progress) -> list[dict[str, Any]]:
-    """Fits on Data2 and Data3 of Eq. 2 alone and with memory, trained on Data1, for rigs drawn by seed; in this process."""
-    found = []
-    for done, seed in enumerate(seeds):
-        progress(done, len(seeds))
+class FitTally:
+    """Rigs of the rig layer, one per seed, and how well what their Data1 gave simulates their Data2 and Data3; in this process.
+
+    Attributes:
+        steps: of work in each rig.
+        block: rigs after which it is worth keeping what was found.
+        found: of each rig its `seed`, and per model (`oe`: Eq. 2 alone, `memory`) the NRMSE fits, %.
+    """
+
+    steps, block = 1, 1
+
+    def __init__(self, memory: Structure = MEMORY) -> None:
+        self.memory = memory
+        self.found: list[dict[str, Any]] = []
+
+    @property
+    def rigs(self) -> int:
+        """How many."""
+        return len(self.found)
+
+    def add(self, seed: int, step: Callable[[int], None]) -> None:
+        """Excite, fit and score one more rig."""
+        step(0)
         plant = PlantConfig(layer="rig", seed=seed)
         data1, data2 = halves(excite(FAST, plant, seed))
         data3 = excite(SLOW, plant, seed)
         bare = fit_output_error(PAPER, [data1])
-        fits = {"oe": bare, "memory": fit_output_error(MEMORY, [data1], bare)}
+        fits = {"oe": bare, "memory": fit_output_error(self.memory, [data1], bare)}
         scores = {key: {"Data2": score(fit, data2), "Data3": score(fit, data3)} for key, fit in fits.items()}
-        found.append({"seed": seed, **scores})
-    progress(len(seeds), len(seeds))
-    return found
+        self.found.append({"seed": seed, **scores})
+
+    def counted(self) -> dict[str, Any]:
+        """Of one or more rigs: all fits, and per model and data their `median`, the `worst` and of which rig it is."""
+        return {"rigs": self.rigs, "models": {key: self._over_rigs(key) for key in ("oe", "memory")}, "fits": self.found}
+
+    def _over_rigs(self, key: str) -> dict[str, dict[str, float]]:
+        out = {}
+        for data in DATA[1:]:
+            fits = [rig[key][data] for rig in self.found]
+            worst = int(np.argmin(fits))
+            out[data] = {"median": float(np.median(fits)), "worst": fits[worst], "worst_seed": self.found[worst]["seed"]}
+        return out

@@ -29,7 +29,7 @@ from softloop.offline.identification.structure import PAPER
 from softloop.plant.config import PlantConfig
 
 Floats = NDArray[np.float64]
-Progress = Callable[[int, int], None]
+Step = Callable[[int], None]
 
 IDEAL_METHODS = ("ls white", "ls coloured", "iv coloured", "oe white", "oe coloured")
 RIG_METHODS = ("white", "coloured", "bootstrap")
@@ -43,26 +43,55 @@ def true_values() -> Floats:
     return np.array([getattr(bending, name).value for name in PAPER.names])
 
 
-def count_ideal(seeds: range, progress: Progress) -> dict[str, Any]:
-    """Identify ideal rigs, one per seed, and count which intervals hold the true values.
+@dataclass(frozen=True)
+class _Held:
+    """One method's values (p,), the ends of its intervals and its standard errors."""
 
-    Returns:
-        per method and parameter: `held` (share), `low` and `high` (its 95 % binomial interval), `error_percent` (mean error)
-        and `half_percent` (median half width), both relative to the true value.
+    values: Floats
+    low: Floats
+    high: Floats
+    errors: Floats
+
+    @classmethod
+    def of(cls, found: Uncertainty) -> _Held:
+        low, high = found.interval()
+        return cls(found.values, low, high, found.errors)
+
+
+class IdealTally:
+    """Ideal rigs identified so far, one per seed, and which intervals held the true values.
+
+    Attributes:
+        steps: of work in each rig.
+        block: rigs after which it is worth keeping what was counted.
     """
-    truth = true_values()
-    found: dict[str, list[Uncertainty]] = {name: [] for name in IDEAL_METHODS}
-    for done, seed in enumerate(seeds):
-        progress(done, len(seeds))
+
+    steps, block = 1, 10
+
+    def __init__(self) -> None:
+        self._rigs: list[dict[str, _Held]] = []
+
+    @property
+    def rigs(self) -> int:
+        """How many."""
+        return len(self._rigs)
+
+    def add(self, seed: int, step: Step) -> None:
+        """Identify one more rig by every method."""
+        step(0)
         data1, _ = halves(excite(FAST, PlantConfig(layer="ideal", seed=seed), seed))
-        for name, uncertainty in _all_methods(data1):
-            found[name].append(uncertainty)
-    progress(len(seeds), len(seeds))
-    return {
-        "rigs": len(seeds),
-        "first_seed": seeds.start,
-        "methods": {name: _counted(entries, truth) for name, entries in found.items()},
-    }
+        self._rigs.append({name: _Held.of(uncertainty) for name, uncertainty in _all_methods(data1)})
+
+    def counted(self) -> dict[str, Any]:
+        """Of one or more rigs, per method and parameter.
+
+        Returns:
+            `held` (share), `low` and `high` (its 95 % binomial interval), `error_percent` (mean error) and `half_percent` (median
+            half width), both relative to the true value.
+        """
+        truth = true_values()
+        methods = {name: _counted([rig[name] for rig in self._rigs], truth) for name in IDEAL_METHODS}
+        return {"rigs": self.rigs, "methods": methods}
 
 
 def _all_methods(data: Series) -> Iterator[tuple[str, Uncertainty]]:
@@ -76,16 +105,15 @@ def _all_methods(data: Series) -> Iterator[tuple[str, Uncertainty]]:
     yield "oe coloured", of_fit(oe, [data], "coloured")
 
 
-def _counted(entries: list[Uncertainty], truth: Floats) -> dict[str, dict[str, float]]:
-    ends = np.array([entry.interval() for entry in entries])  # (rigs, 2, p)
-    values = np.array([entry.values for entry in entries])
-    held = (ends[:, 0] <= truth) & (truth <= ends[:, 1])
+def _counted(entries: list[_Held], truth: Floats) -> dict[str, dict[str, float]]:
+    low, high, values = (np.array([getattr(e, key) for e in entries]) for key in ("low", "high", "values"))
+    held = (low <= truth) & (truth <= high)
     out = {}
-    for i, name in enumerate(entries[0].names):
+    for i, name in enumerate(PAPER.names):
         size = abs(float(truth[i]))
         out[name] = _share(int(held[:, i].sum()), len(entries)) | {
             "error_percent": 100.0 * float(values[:, i].mean() - truth[i]) / size,
-            "half_percent": 50.0 * float(np.median(ends[:, 1, i] - ends[:, 0, i])) / size,
+            "half_percent": 50.0 * float(np.median(high[:, i] - low[:, i])) / size,
         }
     return out
 
@@ -98,29 +126,43 @@ def _share(held: int, of: int) -> dict[str, float]:
 @dataclass(frozen=True)
 class _Repeat:
     values: Floats
-    methods: dict[str, Uncertainty]
+    methods: dict[str, _Held]
 
 
-def count_rig(seeds: range, progress: Progress, repeats: int = REPEATS) -> dict[str, Any]:
-    """Excite each rig `repeats` times, each time anew, and count what intervals hold.
+class RigTally:
+    """Rigs excited `repeats` times each, each time anew, and what intervals held; attributes as `IdealTally`'s."""
 
-    Returns:
-        per method and parameter: `mean_held`, the share of the intervals that hold the mean over all repeats; `scatter_held`,
-        the share of the other experiments' values that an interval for the next experiment holds; `spread_percent`, the
-        standard deviation over repeats, and `error_percent`, the median standard error, relative to the mean.
-    """
-    rigs = []
-    for index, seed in enumerate(seeds):
+    block = 1
+
+    def __init__(self, repeats: int = REPEATS) -> None:
+        self.steps = repeats
+        self._rigs: list[list[_Repeat]] = []
+
+    @property
+    def rigs(self) -> int:
+        """How many."""
+        return len(self._rigs)
+
+    def add(self, seed: int, step: Step) -> None:
+        """Excite one more rig `repeats` times."""
         found = []
-        for repeat in range(repeats):
-            progress(index * repeats + repeat, len(seeds) * repeats)
+        for repeat in range(self.steps):
+            step(repeat)
             data1, _ = halves(excite(FAST, PlantConfig(layer="rig", seed=seed), 1000 * seed + repeat))
             fit = fit_output_error(PAPER, [data1])
-            found.append(_Repeat(fit.values[:-2], {m: of_fit(fit, [data1], m, repeat + 1) for m in RIG_METHODS}))
-        rigs.append(found)
-    progress(len(seeds) * repeats, len(seeds) * repeats)
-    methods = {m: _held_by_one(rigs, m) for m in RIG_METHODS} | {"between": _held_by_groups(rigs)}
-    return {"rigs": len(seeds), "first_seed": seeds.start, "repeats": repeats, "group": GROUP, "methods": methods}
+            found.append(_Repeat(fit.values[:-2], {m: _Held.of(of_fit(fit, [data1], m)) for m in RIG_METHODS}))
+        self._rigs.append(found)
+
+    def counted(self) -> dict[str, Any]:
+        """Of one or more rigs, per method and parameter.
+
+        Returns:
+            `mean_held`, the share of the intervals that hold the mean over all repeats; `scatter_held`, the share of the other
+            experiments' values that an interval for the next experiment holds; `spread_percent`, the standard deviation over
+            repeats, and `error_percent`, the median standard error, relative to the mean.
+        """
+        methods = {m: _held_by_one(self._rigs, m) for m in RIG_METHODS} | {"between": _held_by_groups(self._rigs)}
+        return {"rigs": self.rigs, "repeats": self.steps, "group": GROUP, "methods": methods}
 
 
 def _held_by_one(rigs: list[list[_Repeat]], method: str) -> dict[str, dict[str, float]]:
@@ -129,7 +171,7 @@ def _held_by_one(rigs: list[list[_Repeat]], method: str) -> dict[str, dict[str, 
         values = np.array([f.values for f in found])
         mean, others = values.mean(axis=0), len(found) - 1
         for f in found:
-            low, high = f.methods[method].interval()
+            low, high = f.methods[method].low, f.methods[method].high
             mean_held.append((low <= mean) & (mean <= high))
             half = 0.5 * (high - low) * sqrt(2.0)
             scatter_held.append((np.sum(np.abs(values - f.values) <= half, axis=0) - 1) / others)
@@ -143,16 +185,15 @@ def _held_by_groups(rigs: list[list[_Repeat]]) -> dict[str, dict[str, float]]:
     quantile = float(student.ppf(0.5 + 0.5 * LEVEL, GROUP - 1))
     for found in rigs:
         values = np.array([f.values for f in found])
-        mean = values.mean(axis=0)
         for first in range(0, len(values) - GROUP + 1, GROUP):
             own = values[first : first + GROUP]
             other = np.delete(values, np.s_[first : first + GROUP], axis=0)
-            spread = own.std(axis=0, ddof=1)
+            mean, spread = other.mean(axis=0), own.std(axis=0, ddof=1)  # of the others: its own five would flatter it
             mean_held.append(np.abs(own.mean(axis=0) - mean) <= quantile * spread / sqrt(GROUP))
             half = quantile * spread * sqrt(1.0 + 1.0 / GROUP)
             scatter_held.append(np.mean(np.abs(other - own.mean(axis=0)) <= half, axis=0))
             errors.append(spread / sqrt(GROUP) / np.abs(mean))
-        spreads.append(values.std(axis=0, ddof=1) / np.abs(mean))
+        spreads.append(values.std(axis=0, ddof=1) / np.abs(values.mean(axis=0)))
     return _table(mean_held, scatter_held, errors, spreads)
 
 

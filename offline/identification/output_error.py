@@ -72,6 +72,7 @@ class Problem:
         if structure.at_rest:
             self.free[structure.place("d")] = False
         self.counted = [e.counted for e in experiments]
+        self._begun = [_beginning(e) for e in experiments]
         self._seen: tuple[bytes, list[Floats]] = (b"", [])
 
     def substeps(self, values: Floats) -> int:
@@ -107,12 +108,16 @@ class Problem:
         return out
 
     def residuals(self, unknowns: Floats, fixed: Floats) -> Floats:
-        """Simulated less measured where it counts, deg, then the bounds."""
+        """Simulated less measured where it counts, deg, then the bounds, then first states less measured ones.
+
+        Memory would take up whatever a first state long before the window leaves in it; the next run has no such state.
+        """
         values, starts = self.unpack(unknowns, fixed)
         angles = self.simulated(values, starts)
         self._seen = (unknowns.tobytes(), angles)
         parts = [(a - e.angle_deg)[c] for a, e, c in zip(angles, self.experiments, self.counted, strict=True)]
-        return np.concatenate([*parts, self.bounds(values)])
+        first = [(start - b.state) * b.weight for start, b in zip(starts, self._begun, strict=True)]
+        return np.concatenate([*parts, self.bounds(values), *first])
 
     def bounds(self, values: Floats) -> Floats:
         """How far a, c and the static stiffness are outside their bounds on the grid; 0 inside. In deg, so that they weigh."""
@@ -141,7 +146,9 @@ class Problem:
             simulate_all(moved, self.structure.layout, experiment.time_s, experiment.pressure_kpa, steps, out)
             out -= centre[index]
             rows[index][:, columns] = out[:, self.counted[index]].T / STEP
-        return np.vstack([*rows, self._bounds_jacobian(values, places, len(unknowns))])
+        first = np.zeros((starts.size, len(unknowns)))
+        first[:, len(places) :] = np.diag(np.concatenate([self.scale[-2:] * b.weight for b in self._begun]))
+        return np.vstack([*rows, self._bounds_jacobian(values, places, len(unknowns)), first])
 
     def _moved(self, values: Floats, start: Floats, places: NDArray[np.int64], index: int) -> tuple[Floats, list[int]]:
         """Parameter rows, one step away in each unknown that touches this experiment, and which unknowns those are."""
@@ -193,22 +200,33 @@ def solve(problem: Problem, values: Floats, starts: Floats, iterations: int = 60
     return Fit(problem.structure, fitted, first, tuple(fits), int(found.nfev))
 
 
+@dataclass(frozen=True)
+class _Beginning:
+    """Angle and rate (2,) that the first samples show, and the weights (2,) of those among them that do not count."""
+
+    state: Floats
+    weight: Floats
+
+
 def first_states(experiments: Sequence[Series]) -> Floats:
     """Angle and rate at the start of each experiment, (experiments, 2).
 
     At rest, the mean angle before a pressure moves; a series that begins in motion gets a line through its first samples.
     """
-    return np.array([_first_state(e) for e in experiments])
+    return np.array([_beginning(e).state for e in experiments])
 
 
-def _first_state(experiment: Series) -> tuple[float, float]:
+def _beginning(experiment: Series) -> _Beginning:
     moved = np.abs(experiment.pressure_kpa - experiment.pressure_kpa[0]) > STILL * np.ptp(experiment.pressure_kpa, axis=0)
     still = int(np.argmax(moved.any(axis=1))) if moved.any() else len(moved)
+    count = max(still, FIRST_SAMPLES)
+    time_s, angle = experiment.time_s[:count] - experiment.time_s[0], experiment.angle_deg[:count]
+    alone = ~experiment.counted[:count]  # the others are compared with the simulation as it is
+    weight = np.sqrt([alone.sum(), np.sum((time_s[alone] - time_s.mean()) ** 2)])
     if still > FIRST_SAMPLES:
-        return float(np.mean(experiment.angle_deg[:still])), 0.0
-    time_s, angle = experiment.time_s[:FIRST_SAMPLES], experiment.angle_deg[:FIRST_SAMPLES]
-    rate, level = np.polyfit(time_s - time_s[0], angle, 1)
-    return float(level), float(rate)
+        return _Beginning(np.array([np.mean(angle), 0.0]), weight)
+    rate, level = np.polyfit(time_s, angle, 1)
+    return _Beginning(np.array([level, rate]), weight)
 
 
 def free_run(fit: Fit, experiment: Series) -> Floats:

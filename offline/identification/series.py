@@ -18,6 +18,8 @@ _APPROACH, _TRACK = constant("CycleRecord", "PHASE_APPROACH"), constant("CycleRe
 SETTLE_S = 2.0  # at the start of the trajectory: the move to its first point has died out
 LEAST_SAMPLES = 50
 LEAD_RANGE = 0.15
+UNEVEN = 0.1  # part of a step by which its neighbours may differ from it
+_FOUR = (-1, 0, 1, 2)
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ def nrmse_fit(measured: Floats, simulated: Floats) -> float:
 def from_samples(name: str, pressure: Any, inclination: Any, window_s: tuple[float, float], start_ns: int) -> Series:
     """A series from two streams with clocks of their own; both have `stamp_ns`.
 
-    The pressure is taken straight between its samples at the instants of the angle, so that no sample of the angle is touched.
+    The pressure is taken between its samples at the instants of the angle, so that no sample of the angle is touched.
     """
     _, once = np.unique(inclination["stamp_ns"], return_index=True)
     inclination = inclination[once]
@@ -96,10 +98,28 @@ def from_samples(name: str, pressure: Any, inclination: Any, window_s: tuple[flo
         raise BadFile(f"{name}: {len(inclination)} samples of angle with pressure; identification needs {LEAST_SAMPLES} or more")
     time_s = (inclination["stamp_ns"] - start_ns) * 1e-9
     at_s = (pressure["stamp_ns"] - start_ns) * 1e-9
-    chamber = np.interp(time_s, at_s, pressure["chamber_pressure_kpa"])
+    chamber = between_samples(time_s, at_s, pressure["chamber_pressure_kpa"])
     angle = np.unwrap(inclination["angle_deg"], period=360.0)
     begin = _lead_in(time_s, angle, window_s)
     return Series(name, time_s[begin:], chamber[begin:, None], angle[begin:], window_s)
+
+
+def between_samples(time_s: Floats, at_s: Floats, values: Floats) -> Floats:
+    """`values` (n,), sampled at `at_s` (n,), at the times `time_s` (k,) among them.
+
+    A chord lies always on the inner side of its arc, which would make b(y) smaller than it is. So it is a cubic through four
+    samples; where these are not even, because one was lost or came late, straight between two.
+    """
+    straight = np.interp(time_s, at_s, values)
+    if len(at_s) < len(_FOUR):
+        return straight
+    j = np.clip(np.searchsorted(at_s, time_s, "right") - 1, 1, len(at_s) - 3)
+    steps = np.stack([at_s[j + k + 1] - at_s[j + k] for k in _FOUR[:-1]])
+    u = (time_s - at_s[j]) / steps[1]
+    weights = (-u * (u - 1) * (u - 2) / 6, (u + 1) * (u - 1) * (u - 2) / 2, -(u + 1) * u * (u - 2) / 2, (u + 1) * u * (u - 1) / 6)
+    even = np.abs(steps - steps[1]).max(axis=0) <= UNEVEN * steps[1]
+    curved = sum(w * values[j + k] for w, k in zip(weights, _FOUR, strict=True))
+    return np.asarray(np.where(even & (u >= 0.0) & (u <= 1.0), curved, straight), np.float64)
 
 
 def _lead_in(time_s: Floats, angle_deg: Floats, window_s: tuple[float, float]) -> int:

@@ -1,6 +1,6 @@
-"""The documentation's commands that need no running rig and take long: experiments, identification, the reproduction; with less to do.
+"""The documentation's commands that need no running rig and take long: experiments, identification, the reproduction.
 
-They are carried out in the order of the pages, so that each finds what the ones before it left.
+They are carried out in the order of the pages, so that each finds what the ones before it left, and with less to do.
 """
 
 import re
@@ -23,15 +23,9 @@ pytestmark = pytest.mark.commands
 
 LIMIT_S = 400.0
 EXPERIMENT = ("experiment", "pressure")
-STANDS_FOR = {
-    "BENCH": "sim",
-    "RUN...": "runs/p/excitation_1hz",
-    "100:120": "100:101",
-    "200": "2",
-    "0:3": "0:1",
-    "3": "1",
-    "smc,arc_eso": "smc",
-}
+STANDS_FOR = {"BENCH": "sim", "RUN...": "runs/p/excitation_1hz", "smc,arc_eso": "smc"}
+STANDS_FOR |= {"100:120": "100:101", "200": "2", "1000": "2", "0:3": "0:1", "0:20": "0:1", "3": "1"}
+SAYS_NO = "--law pressure"  # follows to some 4 kPa, and its page says so
 FIRST = [*EXPERIMENT, "sim", "--pace", "batch", "--out", "runs/p"]
 ORDER = ("experiments.md", "identification.md", "parity.md", "tracking.md", "real-rig.md")
 
@@ -82,7 +76,7 @@ def save(file, head, *columns):
 @pytest.mark.parametrize("command", [pytest.param(words, id=" ".join(words)) for words in commands()])
 def test_a_command(place, command):
     code, said = place.run(less(command), limit_s=LIMIT_S)
-    assert code == 0, said
+    assert code == (1 if SAYS_NO in " ".join(command) else 0), said
 
 
 def test_all_that_is_offline_is_here():

@@ -93,7 +93,7 @@ def test_coverage_counts_and_writes(tmp_path, capsys):
     assert softloop("coverage", "--rigs", 2, "--first-seed", 7, "--output", file, "--json") == 0
     counted = json.loads(file.read_text())
     assert counted == json.loads(capsys.readouterr().out)
-    assert counted["rigs"] == 2
+    assert (counted["rigs"], counted["asked_rigs"], counted["first_seed"]) == (2, 2, 7)
     row = counted["methods"]["oe coloured"]["b0"]
     assert row["low"] <= row["held"] <= row["high"]
     assert 0.0 < row["half_percent"] < 1.0

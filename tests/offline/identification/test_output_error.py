@@ -55,6 +55,22 @@ def test_the_jacobian_is_the_residuals_own():
         assert np.abs(jacobian[:, i] - numeric).max() <= 2e-2 * max(np.abs(numeric).max(), 1e-6), i
 
 
+def test_a_first_state_before_the_window_is_that_of_the_first_samples():
+    """What memory the model lacks must not end up in a first state that no other run has."""
+    more = Structure(hysteresis=2, creep=2)
+    values = values_of(more, h1=120.0, h2=80.0, w1=3.0, w2=20.0, k1=4.0, k2=4.0, rate1=0.05, rate2=0.6)
+    train = measured(more, values, seconds=40.0, noise_deg=0.05, window_s=(6.0, 40.0))
+    fit = fit_output_error(Structure(hysteresis=1, creep=1), [train])
+    assert fit.starts[0, 0] == pytest.approx(train.angle_deg[0], abs=0.3)
+    unseen = measured(more, values, seed=5, window_s=(6.0, 40.0))
+    assert score(fit, unseen) > 97.0
+    alone = Problem(PAPER, [train])
+    values, starts = values_of(PAPER), np.array([[train.angle_deg[0] + 50.0, 0.0]])
+    assert np.sum(alone.residuals(alone.pack(values, starts), values)[-2:] ** 2) > 1e3
+    whole = Problem(PAPER, [measured(PAPER, values, seconds=5.0)])  # its first samples count themselves
+    assert not whole.residuals(whole.pack(values, starts), values)[-2:].any()
+
+
 def test_a_fit_stays_stable_on_and_beyond_its_range():
     noisy = measured(PAPER, values_of(PAPER), seconds=6.0, noise_deg=3.0)
     fit = fit_output_error(Structure(m=4, r=4), [noisy])

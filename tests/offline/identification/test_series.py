@@ -3,7 +3,7 @@ import pytest
 
 from softloop.controller.records import CYCLE
 from softloop.offline.identification.experiments import FAST, excite, halves
-from softloop.offline.identification.series import Series, from_cycles, nrmse_fit
+from softloop.offline.identification.series import Series, between_samples, from_cycles, nrmse_fit
 from softloop.plant.config import PlantConfig
 from softloop.wire.errors import BadFile
 
@@ -31,6 +31,21 @@ def test_even_series_hold_the_window_only():
     assert even.time_s[0] >= 2.0
     assert even.angle_deg == pytest.approx(3 * even.time_s)
     assert even.pressure_kpa[:, 1] == pytest.approx(2 * even.time_s)
+
+
+def test_between_samples_a_curve_is_a_curve_and_where_one_is_missing_straight():
+    at_s, wanted = np.arange(0.0, 2.0, 0.005), np.arange(0.001, 1.99, 0.0037)
+    wave, exact = np.sin(6.0 * at_s), np.sin(6.0 * wanted)
+    inside = (wanted > 0.005) & (wanted < 1.985)  # four samples around it
+    curved, straight = between_samples(wanted, at_s, wave), np.interp(wanted, at_s, wave)
+    assert np.abs(curved - exact)[inside].max() < 1e-7 < 1e-5 < np.abs(straight - exact)[inside].max()
+    assert between_samples(at_s, at_s, wave) == pytest.approx(wave, abs=1e-15)
+    assert between_samples(wanted, at_s, 3.0 - 2.0 * at_s) == pytest.approx(3.0 - 2.0 * wanted)
+    lost = np.delete(np.arange(len(at_s)), [100, 101])
+    near = (wanted > at_s[99]) & (wanted < at_s[102])
+    assert (between_samples(wanted, at_s[lost], wave[lost])[near] == np.interp(wanted, at_s[lost], wave[lost])[near]).all()
+    few = between_samples(np.array([0.0, 0.5, 1.0]), np.array([0.0, 1.0]), np.array([2.0, 4.0]))
+    assert few.tolist() == [2.0, 3.0, 4.0]
 
 
 def test_a_simulated_run_gives_both_halves_in_the_span_of_the_excitation():
