@@ -18,7 +18,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from softloop.deploy.bench import PROCESS_NAMES, Bench, find_bench, load_bench
 from softloop.deploy.zenohd import nested
-from softloop.wire.config import TLS, TlsConfig
+from softloop.wire.config import TlsConfig
 from softloop.wire.errors import EXIT_OK, BadConfig, Unavailable
 from softloop.wire.identity import (
     AUTHORITY,
@@ -145,7 +145,7 @@ class _Maker:
         self._write(name, key, builder.add_extension(own, critical=False).sign(self.authority_key, SHA256()))
 
     def _hosts(self) -> Iterator[x509.GeneralName]:
-        where = self.bench.zenoh.endpoint.removeprefix(TLS).rpartition(":")[0].strip("[]")
+        where = self.bench.zenoh.endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
         machines = [machine.address for machine in self.bench.hosts.values() if machine.address]
         for host in dict.fromkeys((where, *machines, *self.tls.names, *HERE)):
             try:

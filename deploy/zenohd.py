@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import socket
@@ -12,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from softloop.wire.config import ZenohConfig
+from softloop.wire.config import QUIC, ZenohConfig
 from softloop.wire.errors import Unavailable
 from softloop.wire.identity import Identity
 from softloop.wire.session import UNIX, settings_of
@@ -85,8 +86,21 @@ def listens(where: str) -> bool:
         with socket.socket(socket.AF_UNIX) as probe:
             return probe.connect_ex(where[len(UNIX) :]) == 0
     host, port = where.split("/", 1)[1].rsplit(":", 1)
+    if where.startswith(QUIC):
+        return _is_taken(host.strip("[]"), int(port))
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=1.0):
             return True
     except OSError:
         return False
+
+
+def _is_taken(host: str, port: int) -> bool:
+    """A UDP port of this machine is somebody's; one of another machine cannot be asked."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            return error.errno == errno.EADDRINUSE
+    return False

@@ -30,6 +30,11 @@ class Channel:
     realtime: bool = False
     logged: bool = True
 
+    @property
+    def sampled(self) -> bool:
+        """On the 5 ms path and there again in the next period, so that one that is lost is better not sent again."""
+        return self.staleness_ns > 0
+
 
 PRESSURE = Channel("pressure", "PressureSample", 200.0, 20 * MS, realtime=True)
 INCLINATION = Channel("inclination", "InclinationSample", 200.0, 30 * MS, realtime=True)

@@ -14,7 +14,8 @@ from pydantic import Field, field_validator, model_validator
 from softloop.wire.benchfile import Table
 
 _LOCAL = ("unixsock-stream/", "tcp/127.0.0.1:", "tcp/[::1]:", "tcp/localhost:")
-TLS = "tls/"
+TLS, QUIC = "tls/", "quic/"
+SECURED = (TLS, QUIC)  # both are mutual TLS, over TCP and over UDP
 IDENTITY = r"^[a-z0-9_-]{1,24}$"
 
 
@@ -95,8 +96,8 @@ class ZenohConfig(Table):
     @field_validator("endpoint")
     @classmethod
     def _is_known(cls, value: str) -> str:
-        if value and not value.startswith((*_LOCAL, TLS)):
-            raise ValueError(f"must begin with one of {', '.join(_LOCAL)}, or, off this machine too, with {TLS}")
+        if value and not value.startswith((*_LOCAL, *SECURED)):
+            raise ValueError(f"must begin with one of {', '.join(_LOCAL)}, or, off this machine too, with {TLS} or {QUIC}")
         return value
 
     @field_validator("listen")
@@ -107,16 +108,21 @@ class ZenohConfig(Table):
     @model_validator(mode="after")
     def _is_secured(self) -> Self:
         """Off this machine only with TLS; and TLS never by half."""
-        if self.endpoint.startswith(TLS) and self.tls is None:
-            raise ValueError("an endpoint tls/... needs the table [zenoh.tls]; see docs/security.md")
+        if self.endpoint.startswith(SECURED) and self.tls is None:
+            raise ValueError("an endpoint tls/... or quic/... needs the table [zenoh.tls]; see docs/security.md")
         if self.listen and self.tls is None and not is_loopback(self.listen):
             raise ValueError("an address off this machine to listen on needs the table [zenoh.tls]; see docs/security.md")
-        if self.tls is not None and not self.endpoint.startswith(TLS):
-            raise ValueError("with [zenoh.tls] the endpoint must be tls/HOST:PORT")
+        if self.tls is not None and not self.endpoint.startswith(SECURED):
+            raise ValueError("with [zenoh.tls] the endpoint must be tls/HOST:PORT or quic/HOST:PORT")
         return self
 
     def meeting_point(self, bench: str) -> str:
         return self.endpoint or default_endpoint(bench)
+
+    @property
+    def datagrams(self) -> bool:
+        """Whether links can carry a message that is not sent again when it is lost."""
+        return self.endpoint.startswith(QUIC)
 
 
 class PaceConfig(Table):

@@ -96,7 +96,7 @@ def settings(tls: TlsConfig, bench: str, name: str) -> dict[str, Any]:
             "verify_name_on_connect": True,
             "close_link_on_expiration": True,
         },
-        "transport/link/protocols": ["tls"],
+        "transport/link/protocols": ["tls", "quic"],
         "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "transport/unicast/max_sessions": MAX_SESSIONS,
         "access_control": access_control(bench, tls.operators, tls.guests),

@@ -18,7 +18,7 @@ import zenoh
 
 from softloop.wire.backlog import Backlog
 from softloop.wire.channels import ROOT, Channel, alive_key, key, node_of
-from softloop.wire.config import TLS, ZenohConfig
+from softloop.wire.config import QUIC, SECURED, ZenohConfig
 from softloop.wire.errors import Unavailable
 from softloop.wire.identity import Identity, identity_of
 from softloop.wire.rights import RIGHTS, ROUTER
@@ -59,10 +59,10 @@ def settings_of(
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
-        "listen/endpoints": listen,
+        "listen/endpoints": [_locator(one) for one in listen],
         "listen/exit_on_failure": listen_must_work,
         "listen/timeout_ms": 0,
-        "connect/endpoints": connect,
+        "connect/endpoints": [_locator(one) for one in connect],
         "connect/exit_on_failure": False,
         "connect/timeout_ms": _patience_ms(mode, listen_must_work=listen_must_work),
         # 20 to 100 ms: a router that came back is found again well within the 2 s a rig may be without one.
@@ -78,6 +78,11 @@ def settings_of(
         "timestamping/enabled": False,
         "adminspace/enabled": False,
     }
+
+
+def _locator(endpoint: str) -> str:
+    """As Zenoh is told of it: over QUIC a message may go as a datagram too, which nothing waits for when it is lost."""
+    return f"{endpoint}?mixed_rel=1" if endpoint.startswith(QUIC) else endpoint
 
 
 def _patience_ms(mode: str, *, listen_must_work: bool) -> int:
@@ -148,7 +153,7 @@ def _open(config: zenoh.Config, where: str) -> zenoh.Session:
 
 def _hint(where: str, text: str) -> str:
     """Zenoh does not say why a link over TLS does not come about."""
-    if not where.startswith(TLS) or "connect" not in text:
+    if not where.startswith(SECURED) or "connect" not in text:
         return ""
     return "; nobody is there, or its certificate is of another authority, expired, or not of this address"
 
@@ -228,8 +233,11 @@ class Wire:
         identity: who this is on a secured bench. Zenoh refuses in silence; what is asked for here is refused with a word.
     """
 
-    def __init__(self, session: zenoh.Session, bench: str, process: str, identity: Identity | None = None) -> None:
+    def __init__(
+        self, session: zenoh.Session, bench: str, process: str, identity: Identity | None = None, *, datagrams: bool = False
+    ) -> None:
         self.session = session
+        self._datagrams = datagrams
         self.identity = identity
         self.bench = bench
         self.process = process
@@ -245,7 +253,7 @@ class Wire:
         """
         if not self.may_put(channel):
             raise self.refused("publish on", channel)
-        publisher = self.declare_publisher(key(self.bench, channel), realtime=channel.realtime)
+        publisher = self.declare_publisher(key(self.bench, channel), realtime=channel.realtime, sampled=channel.sampled)
         put: Callable[[bytes], None] = publisher.put
         put = self._noted(put) if channel.realtime and self.on_put else put
         return put if self.spoil is None else self.spoil(channel, put)
@@ -282,7 +290,8 @@ class Wire:
             return node_of(self.bench, self.process, bus)
         return secrets.randbits(63) + 1
 
-    def declare_publisher(self, full_key: str, *, realtime: bool) -> zenoh.Publisher:
+    def declare_publisher(self, full_key: str, *, realtime: bool, sampled: bool = False) -> zenoh.Publisher:
+        """`sampled`: the next message is soon there and makes this one old; see `Channel`."""
         return self.session.declare_publisher(
             full_key,
             encoding="application/cdr",
@@ -290,7 +299,13 @@ class Wire:
             congestion_control=self.congestion,
             # An express message takes one of the two buffers of its priority for itself: of four put at once two were lost.
             express=False,
+            reliability=self._reliability(sampled=sampled),
         )
+
+    def _reliability(self, *, sampled: bool) -> zenoh.Reliability:
+        """A sample that is lost is not sent again where a link can do without: the next one would be there before it."""
+        lossy = self._datagrams and sampled and not self.exact
+        return zenoh.Reliability.BEST_EFFORT if lossy else zenoh.Reliability.RELIABLE
 
     def latest(self, channel: Channel) -> Latest:
         """The newest sample of a channel: what a control input is. Raises Unavailable without the right to it."""
@@ -339,4 +354,4 @@ def open_wire(config: ZenohConfig, bench: str, process: str) -> Iterator[Wire]:
     """A `Wire` whose session is closed at the end, whatever happened."""
     identity = _known(config, bench, process)
     with _open_as(identity, config, bench, process) as session:
-        yield Wire(session, bench, process, identity)
+        yield Wire(session, bench, process, identity, datagrams=config.datagrams)

@@ -15,6 +15,7 @@ import signal
 import sys
 from contextlib import ExitStack
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 
 from rich.console import Console
@@ -30,7 +31,7 @@ JITTER = 0.2  # of the delay, evenly from none to this, on top of it
 INCIDENTS = {"cable": cut_cable, "router": killed_router}
 FULL_S = 0.0  # until the trajectory's end
 TABLE = (
-    ("delay ms", "{network[delay_ms]:g}"), ("loss %", "{loss:g}"), ("by", "{network[by]}"), ("outcome", "{outcome}"),
+    ("delay ms", "{network[delay_ms]:g}"), ("loss %", "{loss:g}"), ("by", "{network[by]}"), ("over", "{network[over]}"), ("outcome", "{outcome}"),
     ("T2 s", "{f[track_s]:.0f}"), ("max deg", "{f[truth_error_max_deg]:.2f}"), ("rms deg", "{f[truth_error_rms_deg]:.2f}"),
     ("late p50/p99/max us", "{f[tick_late_p50_us]:.0f}/{f[tick_late_p99_us]:.0f}/{f[tick_late_max_us]:.0f}"),
     ("skipped", "{f[ticks_skipped]}"), ("p age p50/p99 ms", "{f[pressure_age_p50_ms]:.1f}/{f[pressure_age_p99_ms]:.1f}"),
@@ -38,14 +39,15 @@ TABLE = (
 )  # fmt: skip
 
 
-def measure(network, way, by, options) -> Cell:
+def measure(network, way, by, over, options) -> Cell:
     """One cell: the rig started on the network, run, and its log read."""
     file = options.json.with_suffix(".relay.json")
     with ExitStack() as held:
         held.enter_context(network.netem(way) if by == "netem" else network.relayed(way, options.seed, file))
-        with rig_on(network, bench_text(network, way, duration_s=FULL_S if options.full else options.seconds)) as rigs:
+        duration_s = FULL_S if options.full else options.seconds
+        with rig_on(network, bench_text(network, way, over=over, duration_s=duration_s)) as rigs:
             codes = rigs.finish()
-            cell = Cell(asdict(way) | {"by": by}, codes)
+            cell = Cell(asdict(way) | {"by": by, "over": over}, codes)
             try:
                 cell.figures, cell.clocks = read(rigs.hosts[LOGGER].run_dir)
             except Exception as error:  # noqa: BLE001 - a run without a log is a result too
@@ -76,7 +78,7 @@ CLOCK_KEYS = ("error_max_ms", "uncertainty_p50_ms")
 
 def show(cells, incidents):
     """The table for a person, and a line for each incident and each bound that was not kept."""
-    table = Table(title="T2 across three hosts over TLS", title_justify="left")
+    table = Table(title="T2 across three hosts, secured", title_justify="left")
     for head, _ in TABLE:
         table.add_column(head, justify="right", no_wrap=False)
     for cell in cells:
@@ -98,7 +100,7 @@ def show(cells, incidents):
 
 
 def failed_of(cells, incidents):
-    named = [(f"{c.network['delay_ms']:g} ms {100 * c.network['loss']:g} % ({c.network['by']})", c.failed) for c in cells]
+    named = [(f"{c.network['delay_ms']:g} ms {100 * c.network['loss']:g} % ({c.network['by']}, {c.network['over']})", c.failed) for c in cells]
     return [(name, text) for name, failed in [*named, *((i["incident"], i["failed"]) for i in incidents)] for text in failed]
 
 
@@ -108,6 +110,7 @@ def parsed():
     parser.add_argument("--seconds", type=float, default=12.0, help="armed, in each cell")
     parser.add_argument("--delays", default="0,1,5", help="ms, one way")
     parser.add_argument("--losses", default="0,1,5", help="percent")
+    parser.add_argument("--over", default="tls", help="of tls and quic")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--incidents", default="cable,router", help="of cable and router")
     parser.add_argument("--json", type=Path, default=Path("build/net/across_hosts.json"))
@@ -138,9 +141,9 @@ def run(options) -> int:
             f"delay and loss by: {', '.join(shapers)}" + ("" if "netem" in shapers else " (this kernel has no netem)"), flush=True
         )
         ways = [Way(d, JITTER * d, loss / 100) for loss in numbers(options.losses) for d in numbers(options.delays)]
-        for way, by in ((way, by) for way in ways for by in shapers):
-            cells.append(measure(network, way, by, options))
-            print(f"{way} by {by}: {cells[-1].outcome}, {cells[-1].failed or 'bounds kept'}", file=sys.stderr, flush=True)
+        for way, by, over in product(ways, shapers, options.over.split(",")):
+            cells.append(measure(network, way, by, over, options))
+            print(f"{way} by {by} over {over}: {cells[-1].outcome}, {cells[-1].failed or 'bounds kept'}", file=sys.stderr, flush=True)
         for incident in (INCIDENTS[word] for word in options.incidents.split(",") if word):
             incidents.append(tried(incident, network))
             print(f"{incidents[-1]}", file=sys.stderr, flush=True)

@@ -14,8 +14,8 @@ HOLD_TICKS = 12
 PORT, SERIAL_PORT = 7447, 7448  # in namespaces of our own: nobody else has them
 
 
-def bench_text(network, way: Way, *, mode="peer", shared_router=False, duration_s=0.0):
-    """The shipped T2 bench on three hosts, over TLS, that declares what the network costs.
+def bench_text(network, way: Way, *, over="tls", mode="peer", shared_router=False, duration_s=0.0):
+    """The shipped T2 bench on three hosts, over TLS on TCP or on QUIC, that declares what the network costs.
 
     Budgets are wide, as in all tests of whole rigs: a stall of a busy machine is not the network's. On a cable that loses packets
     they are as wide as the gate allows: one that is lost comes a round trip and a tick later, if it is not lost again.
@@ -24,7 +24,7 @@ def bench_text(network, way: Way, *, mode="peer", shared_router=False, duration_
     ticks = {"hold_ticks": 20, "age_ticks": 20} if way.loss else {"hold_ticks": HOLD_TICKS, "age_ticks": 16}
     wait_ms = 100.0 if way.loss else 80.0
     tables = {
-        "zenoh": {"mode": mode, "endpoint": f"tls/{network.address_of(LEADER)}:{PORT}"},
+        "zenoh": {"mode": mode, "endpoint": f"{over}/{network.address_of(LEADER)}:{PORT}"},
         "zenoh.tls": {"folder": "{bench_dir}/keys"},
         "run": {"shared_router": shared_router, "duration_s": duration_s, "report": False, "ready_timeout_s": 120.0},
         "clock": {"uncertainty_max_ms": 3.0 + 2.0 * one_way_ms},

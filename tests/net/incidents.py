@@ -19,6 +19,7 @@ DURATION_S = 40.0  # armed, with what is cut out of it
 # machine on top.
 VENT_MS = (HOLD_TICKS + 1) * 5.0 + 5.0 + 5.0 + 10.0
 BACK_S = 2.0
+UNSEEN_NS = 100_000_000  # the log begins again only with the router: what it shows then is no time of a vent
 OPEN_MA = 150.0  # the exhaust valve vents; the law holds it lower
 WAITS = "it waits to be armed again"
 
@@ -79,10 +80,12 @@ def concluded(network, rigs, name, before, lost_ns, back_ns, **found):
 
 
 def vented_ms(log, lost_ns, back_ns):
-    """From the loss until the valves vented, by the plant's truth; rig clock. Without a router nobody logs it."""
-    truth = log["truth"][log["truth"]["stamp_ns"] < back_ns]
-    off = truth[(truth["stamp_ns"] > lost_ns) & (truth["charge_coil_ma"] < COIL_OFF_MA) & (truth["exhaust_coil_ma"] > OPEN_MA)]
-    return float(off["stamp_ns"][0] - lost_ns) * 1e-6 if len(off) else float("inf")
+    """From the loss until the valves vented, by the plant's truth; rig clock. Infinite where nothing was logged meanwhile."""
+    truth = log["truth"][(log["truth"]["stamp_ns"] > lost_ns) & (log["truth"]["stamp_ns"] < back_ns)]
+    off = truth[(truth["charge_coil_ma"] < COIL_OFF_MA) & (truth["exhaust_coil_ma"] > OPEN_MA)]
+    if not len(off) or truth["stamp_ns"][0] - lost_ns > UNSEEN_NS:
+        return float("inf")
+    return float(off["stamp_ns"][0] - lost_ns) * 1e-6
 
 
 def charge_back_ma(log, back_ns):

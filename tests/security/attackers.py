@@ -35,7 +35,8 @@ def attackers_config(bench, keys, name, mode):
     if not name:
         own = ("connect_certificate", "connect_private_key", "enable_mtls")
         told["transport/link/tls"] = {k: v for k, v in told["transport/link/tls"].items() if k not in own}
-    listen = [] if mode == "client" else ["tls/127.0.0.1:0"]
+    over = bench.zenoh.endpoint.partition("/")[0]
+    listen = [] if mode == "client" else [f"{over}/127.0.0.1:0"]
     identity = Identity(name, Rights(), told)
     config = make_config(mode, listen, [bench.zenoh.endpoint], 5000, listen_must_work=False, identity=identity)
     config.insert_json5("connect/timeout_ms", json.dumps(1500))

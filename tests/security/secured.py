@@ -23,17 +23,17 @@ def free_port():
         return probe.getsockname()[1]
 
 
-def zenoh_table(folder, mode="client"):
+def zenoh_table(folder, mode="client", over="tls"):
     """[zenoh] with TLS at a port of its own, and keys in `folder`."""
-    where = f'mode = "{mode}"\nendpoint = "tls/127.0.0.1:{free_port()}"'
+    where = f'mode = "{mode}"\nendpoint = "{over}/127.0.0.1:{free_port()}"'
     return f'[zenoh]\n{where}\n[zenoh.tls]\nfolder = "{folder}/keys"\n'
 
 
-def write_secured(folder, mode="client", more=""):
+def write_secured(folder, mode="client", more="", over="tls"):
     """A bench of every process, as a file."""
     file = folder / "b.toml"
     file.write_text(
-        f'name = "{NAME}"\n{zenoh_table(folder, mode)}[host]\nrealtime_priority = 0\n[can.can0]\n[plant]\n[valves]\n'
+        f'name = "{NAME}"\n{zenoh_table(folder, mode, over)}[host]\nrealtime_priority = 0\n[can.can0]\n[plant]\n[valves]\n'
         f'[pressures]\n[inclinometer]\nport = "/dev/null"\n[controller]\n[recorder]\n[monitor]\n{more}'
     )
     return file
@@ -87,6 +87,6 @@ class Secured:
 
 
 @contextmanager
-def secured(mode="client", more=""):
+def secured(mode="client", more="", over="tls"):
     with short_folder() as folder:
-        yield Secured(folder, write_secured(folder, mode, more))
+        yield Secured(folder, write_secured(folder, mode, more, over))

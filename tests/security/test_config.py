@@ -13,7 +13,7 @@ TLS = {"folder": "/nowhere"}
 
 @pytest.mark.parametrize(
     "endpoint",
-    ["tcp/192.168.1.2:7447", "tcp/0.0.0.0:7447", "tcp/[::]:7447", "udp/127.0.0.1:7447", "quic/10.0.0.1:1"],
+    ["tcp/192.168.1.2:7447", "tcp/0.0.0.0:7447", "tcp/[::]:7447", "udp/127.0.0.1:7447", "ws/10.0.0.1:1"],
 )
 @pytest.mark.parametrize("tls", [None, TLS])
 def test_nothing_else_leaves_this_machine(endpoint, tls):
@@ -21,7 +21,7 @@ def test_nothing_else_leaves_this_machine(endpoint, tls):
         ZenohConfig(endpoint=endpoint, tls=tls)
 
 
-@pytest.mark.parametrize("endpoint", ["tls/192.168.1.2:7447", "tls/rig.example:7447", "tls/[fe80::1]:7447", "tls/127.0.0.1:7447"])
+@pytest.mark.parametrize("endpoint", ["tls/192.168.1.2:7447", "tls/rig.example:7447", "tls/[fe80::1]:7447", "tls/127.0.0.1:7447", "quic/192.168.1.2:7447"])
 def test_tls_does_with_a_table_for_it_and_not_without(endpoint):
     assert ZenohConfig(endpoint=endpoint, tls=TLS).meeting_point("b") == endpoint
     with pytest.raises(ValidationError, match="needs the table"):
@@ -31,7 +31,7 @@ def test_tls_does_with_a_table_for_it_and_not_without(endpoint):
 @pytest.mark.parametrize("endpoint", ["", "tcp/127.0.0.1:7447", "unixsock-stream//tmp/x.sock"])
 def test_tls_never_by_half(endpoint):
     assert ZenohConfig(endpoint=endpoint)
-    with pytest.raises(ValidationError, match="must be tls/HOST:PORT"):
+    with pytest.raises(ValidationError, match="must be tls/HOST:PORT or quic/HOST:PORT"):
         ZenohConfig(endpoint=endpoint, tls=TLS)
 
 

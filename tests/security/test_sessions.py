@@ -1,4 +1,4 @@
-"""Real sessions over TLS on loopback: those who should not be there try to move a valve, to read, to re-arm and to flood."""
+"""Real sessions over TLS and QUIC on loopback: those who should not be there try to move a valve, to read, to re-arm and to flood."""
 
 import threading
 import time
@@ -20,7 +20,7 @@ from tests.security.secured import NAME, secured
 
 WAIT_S = 20.0
 QUIET_S = 0.3
-MODES = ("client", "peer")
+WAYS = [(mode, over) for mode in ("client", "peer") for over in ("tls", "quic")]
 # Who they are: the folder of their keys, the identity, and what their session says it is.
 WITHOUT = {
     "no certificate": ("keys", ""),
@@ -66,7 +66,7 @@ class Rig:
         """The rig's own way works: a command reaches the gate, a valve frame the driver, and both the log. Then all is quiet."""
         until(lambda: self.send_command() or self.commands.take(0.05), "the controller's command does not reach the gate")
         until(lambda: self.send_frame() or self.driver.recv_frame(0.05), "the gate's frame does not reach the driver")
-        until(lambda: self.log.take_all()[0], "nothing reaches the log")
+        until(lambda: self.send_command() or self.log.take_all()[0], "nothing reaches the log")
         quiet_since = time.monotonic()
         while time.monotonic() - quiet_since < QUIET_S:
             if self.commands.take(0.02) or self.driver.recv_frame(0.0) or self.log.take_all()[0]:
@@ -93,16 +93,16 @@ class Rig:
 
 
 @contextmanager
-def rig(mode):
-    with secured(mode) as at, ExitStack() as stack:
+def rig(mode, over):
+    with secured(mode, over=over) as at, ExitStack() as stack:
         made = Rig(at, stack)
         made.is_whole()
         yield made
 
 
-@pytest.fixture(scope="module", params=MODES)
+@pytest.fixture(scope="module", params=WAYS, ids="-".join)
 def one_rig(request):
-    with rig(request.param) as made:
+    with rig(*request.param) as made:
         yield made
 
 
@@ -167,9 +167,9 @@ def test_a_good_certificate_without_the_right_moves_reads_and_arms_nothing(one_r
     one_rig.is_whole()
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_a_guest_reads_and_stops_and_does_nothing_else(mode):
-    with rig(mode) as made, made.at.attacker(made.at.keys, "guest") as session:
+@pytest.mark.parametrize(("mode", "over"), WAYS)
+def test_a_guest_reads_and_stops_and_does_nothing_else(mode, over):
+    with rig(mode, over) as made, made.at.attacker(made.at.keys, "guest") as session:
         until(lambda: session.info.routers_zid(), "no link")
         for full_key, payload in deeds(NAME):
             session.put(full_key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
@@ -224,7 +224,7 @@ def test_questions_are_the_operators_alone():
 
 
 def test_nobody_says_that_another_is_alive():
-    with rig("client") as made, made.at.attacker(made.at.keys, "pressures") as session:
+    with rig("client", "tls") as made, made.at.attacker(made.at.keys, "pressures") as session:
         until(lambda: session.info.routers_zid(), "no link")
         tokens = [session.liveliness().declare_token(f"softloop/{NAME}/alive/{name}") for name in ("controller", "pressures")]
         until(lambda: made.wires["recorder"].processes_alive() == {"pressures"}, "the own token is seen, the other is not")
@@ -248,9 +248,10 @@ def test_a_client_of_a_false_meeting_point_believes_nothing():
             assert requests.take_all() == []
 
 
-def test_a_meeting_point_of_another_authority_is_none(monkeypatch):
+@pytest.mark.parametrize("over", ["tls", "quic"])
+def test_a_meeting_point_of_another_authority_is_none(over, monkeypatch):
     monkeypatch.setattr(session_module, "CLIENT_PATIENCE_MS", 1500)
-    with secured() as at:
+    with secured(over=over) as at:
         stranger = load_bench(at.folder / "wrong.toml")
         with (
             open_router(stranger.zenoh, NAME),
