@@ -71,7 +71,7 @@ def round_trips(bench: Bench, seconds: float) -> tuple[list[int], int]:
     Raises Unavailable when a session cannot be opened.
     """
     with open_wire(bench.zenoh, bench.name, "doctor-a") as near, open_wire(bench.zenoh, bench.name, "doctor-b") as far:
-        back = far.declare_publisher(_key(bench, PONG), realtime=True)
+        back = far.declare_publisher(_key(bench, PONG), realtime=True, sampled=True)
         echo = far.session.declare_subscriber(_key(bench, PING), lambda sample: back.put(sample.payload.to_bytes()))
         inbox = Inbox(near.session, _key(bench, PONG))
         for wire in (near, far):
@@ -83,7 +83,7 @@ def round_trips(bench: Bench, seconds: float) -> tuple[list[int], int]:
 
 
 def _exchange(near: Wire, key: str, inbox: Inbox, count: int) -> tuple[list[int], int]:
-    clock, publisher = WallClock(), near.declare_publisher(key, realtime=True)
+    clock, publisher = WallClock(), near.declare_publisher(key, realtime=True, sampled=True)
     end_s = time.monotonic() + LINK_S
     while _trip(publisher, inbox, 0) is None and time.monotonic() < end_s:  # until both ends are joined
         pass

@@ -27,6 +27,7 @@ UNIX = "unixsock-stream/"
 CLIENT_PATIENCE_MS = 10_000
 SETTLED_S = 0.3  # no link came or went for so long
 SETTLE_AT_MOST_S = 3.0
+DATAGRAM_BATCHES = 16  # as many as Zenoh allows
 
 
 def make_config(
@@ -55,29 +56,41 @@ def settings_of(
     identity: Identity | None = None,
 ) -> dict[str, Any]:
     """The settings in `make_config`, by the path of each."""
-    return (identity.settings if identity else {}) | {
-        "mode": mode,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": True,
-        "listen/endpoints": [_locator(one) for one in listen],
-        "listen/exit_on_failure": listen_must_work,
-        "listen/timeout_ms": 0,
-        "connect/endpoints": [_locator(one) for one in connect],
-        "connect/exit_on_failure": False,
-        "connect/timeout_ms": _patience_ms(mode, listen_must_work=listen_must_work),
-        # 20 to 100 ms: a router that came back is found again well within the 2 s a rig may be without one.
-        "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
-        "open/return_conditions/connect_scouted": False,
-        "transport/link/tx/lease": lease_ms,
-        # A frozen process still has its socket: without these, who meets it waits 10 s, also in closing its own session.
-        "transport/unicast/open_timeout": 1000,
-        "transport/unicast/accept_timeout": 1000,
-        # A stalled reader must cost the 5 ms path nothing: what cannot be sent now is dropped.
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
-        "transport/shared_memory/enabled": False,
-        "timestamping/enabled": False,
-        "adminspace/enabled": False,
-    }
+    return (
+        (identity.settings if identity else {})
+        | _queues(listen + connect)
+        | {
+            "mode": mode,
+            "scouting/multicast/enabled": False,
+            "scouting/gossip/enabled": True,
+            "listen/endpoints": [_locator(one) for one in listen],
+            "listen/exit_on_failure": listen_must_work,
+            "listen/timeout_ms": 0,
+            "connect/endpoints": [_locator(one) for one in connect],
+            "connect/exit_on_failure": False,
+            "connect/timeout_ms": _patience_ms(mode, listen_must_work=listen_must_work),
+            # 20 to 100 ms: a router that came back is found again well within the 2 s a rig may be without one.
+            "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
+            "open/return_conditions/connect_scouted": False,
+            "transport/link/tx/lease": lease_ms,
+            # A frozen process still has its socket: without these, who meets it waits 10 s, also in closing its own session.
+            "transport/unicast/open_timeout": 1000,
+            "transport/unicast/accept_timeout": 1000,
+            # A stalled reader must cost the 5 ms path nothing: what cannot be sent now is dropped.
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+            "transport/shared_memory/enabled": False,
+            "timestamping/enabled": False,
+            "adminspace/enabled": False,
+        }
+    )
+
+
+def _queues(endpoints: list[str]) -> dict[str, Any]:
+    """A link that takes datagrams too is handed batches of one datagram, some 1.2 kB and not 64: two of them, Zenoh's default, are
+    full after a dozen messages each, and what finds them full is dropped."""
+    if not any(endpoint.startswith(QUIC) for endpoint in endpoints):
+        return {}
+    return {f"transport/link/tx/queue/size/{priority}": DATAGRAM_BATCHES for priority in ("real_time", "data")}
 
 
 def _locator(endpoint: str) -> str:

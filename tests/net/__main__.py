@@ -31,7 +31,8 @@ JITTER = 0.2  # of the delay, evenly from none to this, on top of it
 INCIDENTS = {"cable": cut_cable, "router": killed_router}
 FULL_S = 0.0  # until the trajectory's end
 TABLE = (
-    ("delay ms", "{network[delay_ms]:g}"), ("loss %", "{loss:g}"), ("by", "{network[by]}"), ("over", "{network[over]}"), ("outcome", "{outcome}"),
+    ("delay ms", "{network[delay_ms]:g}"), ("loss %", "{loss:g}"), ("by", "{network[by]}"), ("over", "{network[over]}"),
+    ("outcome", "{outcome}"),
     ("T2 s", "{f[track_s]:.0f}"), ("max deg", "{f[truth_error_max_deg]:.2f}"), ("rms deg", "{f[truth_error_rms_deg]:.2f}"),
     ("late p50/p99/max us", "{f[tick_late_p50_us]:.0f}/{f[tick_late_p99_us]:.0f}/{f[tick_late_max_us]:.0f}"),
     ("skipped", "{f[ticks_skipped]}"), ("p age p50/p99 ms", "{f[pressure_age_p50_ms]:.1f}/{f[pressure_age_p99_ms]:.1f}"),
@@ -100,7 +101,10 @@ def show(cells, incidents):
 
 
 def failed_of(cells, incidents):
-    named = [(f"{c.network['delay_ms']:g} ms {100 * c.network['loss']:g} % ({c.network['by']}, {c.network['over']})", c.failed) for c in cells]
+    named = [
+        (f"{c.network['delay_ms']:g} ms {100 * c.network['loss']:g} % ({c.network['by']}, {c.network['over']})", c.failed)
+        for c in cells
+    ]
     return [(name, text) for name, failed in [*named, *((i["incident"], i["failed"]) for i in incidents)] for text in failed]
 
 
@@ -143,9 +147,15 @@ def run(options) -> int:
         ways = [Way(d, JITTER * d, loss / 100) for loss in numbers(options.losses) for d in numbers(options.delays)]
         for way, by, over in product(ways, shapers, options.over.split(",")):
             cells.append(measure(network, way, by, over, options))
-            print(f"{way} by {by} over {over}: {cells[-1].outcome}, {cells[-1].failed or 'bounds kept'}", file=sys.stderr, flush=True)
-        for incident in (INCIDENTS[word] for word in options.incidents.split(",") if word):
-            incidents.append(tried(incident, network))
+            print(
+                f"{way} by {by} over {over}: {cells[-1].outcome}, {cells[-1].failed or 'bounds kept'}",
+                file=sys.stderr,
+                flush=True,
+            )
+        for incident, over in product(
+            (INCIDENTS[word] for word in options.incidents.split(",") if word), options.over.split(",")
+        ):
+            incidents.append(tried(incident, network, over))
             print(f"{incidents[-1]}", file=sys.stderr, flush=True)
     finally:
         network.close()
@@ -156,13 +166,16 @@ def run(options) -> int:
     return 1 if failed_of(cells, incidents) else 0
 
 
-def tried(incident, network):
+def tried(incident, network, over):
     """What came of an incident; where it did not even come to it, that as its failure."""
     try:
-        return incident(network)
+        return incident(network, over)
     except AssertionError as error:
         print(f"{incident.__name__}: {error}", file=sys.stderr)
-        return {"incident": incident.__name__.replace("_", " "), "failed": ["did not come to it: the hosts' words are above"]}
+        return {
+            "incident": f"{incident.__name__.replace('_', ' ')} ({over})",
+            "failed": ["did not come to it: the hosts' words are above"],
+        }
 
 
 def main() -> int:

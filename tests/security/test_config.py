@@ -21,7 +21,10 @@ def test_nothing_else_leaves_this_machine(endpoint, tls):
         ZenohConfig(endpoint=endpoint, tls=tls)
 
 
-@pytest.mark.parametrize("endpoint", ["tls/192.168.1.2:7447", "tls/rig.example:7447", "tls/[fe80::1]:7447", "tls/127.0.0.1:7447", "quic/192.168.1.2:7447"])
+@pytest.mark.parametrize(
+    "endpoint",
+    ["tls/192.168.1.2:7447", "tls/rig.example:7447", "tls/[fe80::1]:7447", "tls/127.0.0.1:7447", "quic/192.168.1.2:7447"],
+)
 def test_tls_does_with_a_table_for_it_and_not_without(endpoint):
     assert ZenohConfig(endpoint=endpoint, tls=TLS).meeting_point("b") == endpoint
     with pytest.raises(ValidationError, match="needs the table"):

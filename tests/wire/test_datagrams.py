@@ -64,7 +64,10 @@ def test_zenoh_is_told_that_a_link_carries_both(endpoint, told):
 def test_samples_and_words_pass_a_real_link(mode):
     with secured(mode, over="quic") as at, open_router(at.bench.zenoh, at.bench.name):
         assert ZenohConfig.model_validate(at.bench.zenoh).datagrams
-        with open_wire(at.bench.zenoh, at.bench.name, "pressures") as a, open_wire(at.bench.zenoh, at.bench.name, "recorder") as b:
+        with (
+            open_wire(at.bench.zenoh, at.bench.name, "pressures") as a,
+            open_wire(at.bench.zenoh, at.bench.name, "recorder") as b,
+        ):
             for wire in (a, b):
                 wire.settle(lambda: False)
             samples, words = b.inbox(PRESSURE), b.inbox(EVENT)
