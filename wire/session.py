@@ -27,6 +27,10 @@ UNIX = "unixsock-stream/"
 CLIENT_PATIENCE_MS = 10_000
 SETTLED_S = 0.3  # no link came or went for so long
 SETTLE_AT_MOST_S = 3.0
+LAST_WORDS_S = 0.3  # QUIC sends again after some 30 ms, then 60 and 120, on a way of a few ms
+# How long a link may take to come about. A packet of its opening that a network loses is sent again after 1 s, and after 2 s
+# more; and a direct link to a peer is tried once.
+OPENING_MS, OPENING_FAR_MS = 1000, 5000
 DATAGRAM_BATCHES = 16  # as many as Zenoh allows
 
 
@@ -56,38 +60,41 @@ def settings_of(
     identity: Identity | None = None,
 ) -> dict[str, Any]:
     """The settings in `make_config`, by the path of each."""
-    return (
-        (identity.settings if identity else {})
-        | _queues(listen + connect)
-        | {
-            "mode": mode,
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": True,
-            "listen/endpoints": [_locator(one) for one in listen],
-            "listen/exit_on_failure": listen_must_work,
-            "listen/timeout_ms": 0,
-            "connect/endpoints": [_locator(one) for one in connect],
-            "connect/exit_on_failure": False,
-            "connect/timeout_ms": _patience_ms(mode, listen_must_work=listen_must_work),
-            # 20 to 100 ms: a router that came back is found again well within the 2 s a rig may be without one.
-            "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
-            "open/return_conditions/connect_scouted": False,
-            "transport/link/tx/lease": lease_ms,
-            # A frozen process still has its socket: without these, who meets it waits 10 s, also in closing its own session.
-            "transport/unicast/open_timeout": 1000,
-            "transport/unicast/accept_timeout": 1000,
-            # A stalled reader must cost the 5 ms path nothing: what cannot be sent now is dropped.
-            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
-            "transport/shared_memory/enabled": False,
-            "timestamping/enabled": False,
-            "adminspace/enabled": False,
-        }
-    )
+    opening_ms = OPENING_MS if identity is None else OPENING_FAR_MS
+    told = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        # Of two peers that hear of each other one connects: else both do, and there are two links between them.
+        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
+        "listen/endpoints": [_locator(one) for one in listen],
+        "listen/exit_on_failure": listen_must_work,
+        "listen/timeout_ms": 0,
+        "connect/endpoints": [_locator(one) for one in connect],
+        "connect/exit_on_failure": False,
+        "connect/timeout_ms": _patience_ms(mode, listen_must_work=listen_must_work),
+        # 20 to 100 ms: a router that came back is found again well within the 2 s a rig may be without one.
+        "connect/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 1.5},
+        "open/return_conditions/connect_scouted": False,
+        "transport/link/tx/lease": lease_ms,
+        # A frozen process still has its socket: without these, who meets it waits 10 s, also in closing its own session.
+        "transport/unicast/open_timeout": opening_ms,
+        "transport/unicast/accept_timeout": opening_ms,
+        # A stalled reader must cost the 5 ms path nothing: what cannot be sent now is dropped.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+        "transport/shared_memory/enabled": False,
+        "timestamping/enabled": False,
+        "adminspace/enabled": False,
+    }
+    return (identity.settings if identity else {}) | _queues(listen + connect) | told
 
 
 def _queues(endpoints: list[str]) -> dict[str, Any]:
-    """A link that takes datagrams too is handed batches of one datagram, some 1.2 kB and not 64: two of them, Zenoh's default, are
-    full after a dozen messages each, and what finds them full is dropped."""
+    """How much may wait for a link.
+
+    One that takes datagrams is handed batches of one datagram, some 1.2 kB and not 64: two of them, Zenoh's default, are full
+    after a dozen messages each, and what finds them full is dropped.
+    """
     if not any(endpoint.startswith(QUIC) for endpoint in endpoints):
         return {}
     return {f"transport/link/tx/queue/size/{priority}": DATAGRAM_BATCHES for priority in ("real_time", "data")}
@@ -356,6 +363,18 @@ class Wire:
         """Show on the network that this process runs, until its session closes."""
         self._token = self.session.liveliness().declare_token(alive_key(self.bench, self.process))
 
+    def take_leave(self) -> None:
+        """Say that this process ends, and over QUIC wait until that and all that was said before is there.
+
+        TCP sends again what a network lost after a session was closed, QUIC does not: others would take this process for alive
+        until its link's lease ends.
+        """
+        if self._token is not None:
+            self._token.undeclare()
+            self._token = None
+        if self._datagrams:
+            time.sleep(LAST_WORDS_S)
+
     def processes_alive(self, timeout_s: float = 0.5) -> set[str]:
         """Names of the processes of this bench that are alive now."""
         replies = self.session.liveliness().get(alive_key(self.bench, "*"), timeout=timeout_s)
@@ -367,4 +386,8 @@ def open_wire(config: ZenohConfig, bench: str, process: str) -> Iterator[Wire]:
     """A `Wire` whose session is closed at the end, whatever happened."""
     identity = _known(config, bench, process)
     with _open_as(identity, config, bench, process) as session:
-        yield Wire(session, bench, process, identity, datagrams=config.datagrams)
+        wire = Wire(session, bench, process, identity, datagrams=config.datagrams)
+        try:
+            yield wire
+        finally:
+            wire.take_leave()
