@@ -1,9 +1,10 @@
 """The rig on three computers with a network between them: how it tracks and how late its ticks are, and what it survives.
 
-    python -m tests.net [--full] [--seconds 12] [--delays 0,1,5] [--losses 0,1,5] [--incidents cable,router] [--seed 1] [--json F]
+    python -m tests.net [--full] [--seconds 12] [--delays 0,1,5] [--losses 0,1,5] [--over tls,quic]
+                        [--incidents cable,router] [--seed 1] [--json F]
 
 Needs root: it makes namespaces, links and a TUN device (`lab.py`), all of which go with it. Every computer has a network and a
-monotonic clock of its own; they speak TLS. Each cell of delay (ms, one way) and loss (%) is T2 for `--seconds` armed, with --full
+monotonic clock of its own; they speak TLS or QUIC. Each cell of delay (ms, one way) and loss (%) is T2 for `--seconds` armed, with --full
 all of its 60 s; then a cable is cut and a router killed. Exit codes: 0, 1 when a bound is not kept, 3 where this
 machine cannot, 130.
 """
@@ -29,6 +30,8 @@ from tests.net.lab import Network, counts, missing
 
 JITTER = 0.2  # of the delay, evenly from none to this, on top of it
 INCIDENTS = {"cable": cut_cable, "router": killed_router}
+# QUIC is not told that a process at the other end is gone: it is known when the link's lease of 5 s ends. See docs/hosts.md.
+UNTRIED = {("router", "quic")}
 FULL_S = 0.0  # until the trajectory's end
 TABLE = (
     ("delay ms", "{network[delay_ms]:g}"), ("loss %", "{loss:g}"), ("by", "{network[by]}"), ("over", "{network[over]}"),
@@ -114,7 +117,7 @@ def parsed():
     parser.add_argument("--seconds", type=float, default=12.0, help="armed, in each cell")
     parser.add_argument("--delays", default="0,1,5", help="ms, one way")
     parser.add_argument("--losses", default="0,1,5", help="percent")
-    parser.add_argument("--over", default="tls", help="of tls and quic")
+    parser.add_argument("--over", default="tls,quic", help="what Zenoh goes over: of tls (TCP) and quic (UDP)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--incidents", default="cable,router", help="of cable and router")
     parser.add_argument("--json", type=Path, default=Path("build/net/across_hosts.json"))
@@ -130,8 +133,12 @@ def finite(found):
     return None if isinstance(found, float) and not math.isfinite(found) else found
 
 
+def words(text):
+    return [word for word in text.split(",") if word]
+
+
 def numbers(text):
-    return [float(word) for word in text.split(",") if word]
+    return [float(word) for word in words(text)]
 
 
 def run(options) -> int:
@@ -145,17 +152,17 @@ def run(options) -> int:
             f"delay and loss by: {', '.join(shapers)}" + ("" if "netem" in shapers else " (this kernel has no netem)"), flush=True
         )
         ways = [Way(d, JITTER * d, loss / 100) for loss in numbers(options.losses) for d in numbers(options.delays)]
-        for way, by, over in product(ways, shapers, options.over.split(",")):
+        for way, by, over in product(ways, shapers, words(options.over)):
             cells.append(measure(network, way, by, over, options))
             print(
                 f"{way} by {by} over {over}: {cells[-1].outcome}, {cells[-1].failed or 'bounds kept'}",
                 file=sys.stderr,
                 flush=True,
             )
-        for incident, over in product(
-            (INCIDENTS[word] for word in options.incidents.split(",") if word), options.over.split(",")
-        ):
-            incidents.append(tried(incident, network, over))
+        for name, over in product(words(options.incidents), words(options.over)):
+            if (name, over) in UNTRIED:
+                continue
+            incidents.append(tried(INCIDENTS[name], network, over))
             print(f"{incidents[-1]}", file=sys.stderr, flush=True)
     finally:
         network.close()
