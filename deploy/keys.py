@@ -31,7 +31,7 @@ from softloop.wire.identity import (
     wall_now,
 )
 from softloop.wire.rights import FOLLOWER, LAUNCHER, RIGHTS, ROUTER, common_name
-from softloop.wire.session import settings_of
+from softloop.wire.zenoh_settings import settings_of
 
 ZENOHD = "zenohd.json5"
 AUTHORITY_DAYS = 3650

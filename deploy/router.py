@@ -19,8 +19,9 @@ from softloop.wire.config import ZenohConfig
 from softloop.wire.errors import Interrupted, Lost, Unavailable
 from softloop.wire.identity import identity_of
 from softloop.wire.rights import ROUTER
-from softloop.wire.session import UNIX, Wire, open_router, open_session, open_wire
+from softloop.wire.session import Wire, open_router, open_session, open_wire
 from softloop.wire.shell import Stop
+from softloop.wire.zenoh_settings import UNIX
 
 POLL_S = 0.1
 JOIN_S = 3.0  # joining takes well under a tenth of a second

@@ -16,7 +16,7 @@ from typing import Any
 from softloop.wire.config import QUIC, ZenohConfig
 from softloop.wire.errors import Unavailable
 from softloop.wire.identity import Identity
-from softloop.wire.session import UNIX, settings_of
+from softloop.wire.zenoh_settings import UNIX, settings_of
 
 POLL_S = 0.05
 LISTEN_S = 10.0

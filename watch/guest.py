@@ -9,7 +9,8 @@ from contextlib import contextmanager
 
 from softloop.wire.config import ZenohConfig
 from softloop.wire.errors import Unavailable
-from softloop.wire.session import UNIX, Wire, open_wire
+from softloop.wire.session import Wire, open_wire
+from softloop.wire.zenoh_settings import UNIX
 
 POLL_S = 0.1
 

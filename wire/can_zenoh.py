@@ -43,7 +43,8 @@ from softloop.wire.channels import CAN, ROOT, bus_key, can_key
 from softloop.wire.clock import Clock, WallClock
 from softloop.wire.config import default_endpoint
 from softloop.wire.errors import SoftloopError
-from softloop.wire.session import UNIX, open_meeting
+from softloop.wire.session import open_meeting
+from softloop.wire.zenoh_settings import UNIX
 
 DEFAULT_BENCH = "default"
 _CHUNK = re.compile(r"[^/*$?#@\s][^/*$?#\s]*")

@@ -17,7 +17,8 @@ from softloop.deploy.run_dir import keep_bench, make_run_dir
 from softloop.deploy.zenohd import find_zenohd, listens, nested, run_zenohd
 from softloop.wire.config import ZenohConfig
 from softloop.wire.errors import BadConfig, Unavailable
-from softloop.wire.session import make_config, open_session, own_endpoint, settings_of
+from softloop.wire.session import open_session
+from softloop.wire.zenoh_settings import make_config, own_endpoint, settings_of
 
 HOSTS = f"""
 base = "{shipped_benches()["sim"]}"

@@ -4,9 +4,9 @@
                         [--incidents cable,router] [--seed 1] [--json F]
 
 Needs root: it makes namespaces, links and a TUN device (`lab.py`), all of which go with it. Every computer has a network and a
-monotonic clock of its own; they speak TLS or QUIC. Each cell of delay (ms, one way) and loss (%) is T2 for `--seconds` armed, with --full
-all of its 60 s; then a cable is cut and a router killed. Exit codes: 0, 1 when a bound is not kept, 3 where this
-machine cannot, 130.
+monotonic clock of its own; they speak TLS over TCP, or QUIC. Each cell of delay (ms, one way), loss (%) and either is T2 for
+`--seconds` armed, with --full all of its 60 s; then a cable is cut and a router killed. Exit codes: 0, 1 when a bound is not
+kept, 3 where this machine cannot, 130.
 """
 
 import argparse

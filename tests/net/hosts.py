@@ -18,8 +18,8 @@ def bench_text(network, way: Way, *, over="tls", mode="peer", shared_router=Fals
     """The shipped T2 bench on three hosts, over TLS on TCP or on QUIC, that declares what the network costs.
 
     Budgets are wide, as in all tests of whole rigs: a stall of a busy machine is not the network's. On a cable that loses packets
-    they are as wide as the gate allows over TCP, where all waits for one that is sent again. Over QUIC the next one is there a tick
-    later, and no budget is for loss.
+    they are as wide as the gate allows over TCP, where all waits for one that is sent again. Over QUIC the next one is there a
+    tick later, and no budget is for loss.
     """
     one_way_ms = way.delay_ms + way.jitter_ms
     waits = way.loss and over == "tls"

@@ -20,7 +20,7 @@ from softloop.wire.channels import ARM, COMMAND, REQUEST, can_key, key
 from softloop.wire.identity import Identity, settings
 from softloop.wire.messages import constant, message
 from softloop.wire.rights import Rights, rights_of
-from softloop.wire.session import make_config
+from softloop.wire.zenoh_settings import make_config
 
 ORIGIN = 666
 FLOOD_BYTES = 1000

@@ -1,4 +1,4 @@
-"""Real sessions over TLS and QUIC on loopback: those who should not be there try to move a valve, to read, to re-arm and to flood."""
+"""Real sessions, secured, on loopback: those who should not be there try to move a valve, to read, to re-arm and to flood."""
 
 import threading
 import time
@@ -9,7 +9,7 @@ import zenoh
 
 from softloop.deploy.bench import load_bench
 from softloop.devices.protocols import can_frames
-from softloop.wire import session as session_module
+from softloop.wire import zenoh_settings
 from softloop.wire.can_zenoh import ZenohBus
 from softloop.wire.channels import ARM, COMMAND, CYCLE, FAULT, PRESSURE, REQUEST, VALVES, key
 from softloop.wire.errors import BadConfig, Unavailable
@@ -250,7 +250,7 @@ def test_a_client_of_a_false_meeting_point_believes_nothing():
 
 @pytest.mark.parametrize("over", ["tls", "quic"])
 def test_a_meeting_point_of_another_authority_is_none(over, monkeypatch):
-    monkeypatch.setattr(session_module, "CLIENT_PATIENCE_MS", 1500)
+    monkeypatch.setattr(zenoh_settings, "CLIENT_PATIENCE_MS", 1500)
     with secured(over=over) as at:
         stranger = load_bench(at.folder / "wrong.toml")
         with (

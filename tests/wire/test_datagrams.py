@@ -8,7 +8,8 @@ import zenoh
 from softloop.deploy.zenohd import listens
 from softloop.wire.channels import ARM, CHANNELS, COMMAND, CYCLE, EVENT, INCLINATION, PRESSURE, REQUEST, VALVES, key
 from softloop.wire.config import ZenohConfig
-from softloop.wire.session import Wire, open_router, open_wire, settings_of
+from softloop.wire.session import Wire, open_router, open_wire
+from softloop.wire.zenoh_settings import settings_of
 from tests.security.secured import secured
 from tests.wire.test_session import sample, send_until_seen, until
 

@@ -10,7 +10,8 @@ from softloop.wire.channels import CHANNELS, COMMAND, EVENT, PRESSURE, channel_o
 from softloop.wire.config import ZenohConfig
 from softloop.wire.errors import Unavailable
 from softloop.wire.messages import message
-from softloop.wire.session import Wire, make_config, open_meeting, open_router, open_session, open_wire
+from softloop.wire.session import Wire, open_meeting, open_router, open_session, open_wire
+from softloop.wire.zenoh_settings import make_config
 from tests.wire.rendezvous import meeting, short_folder, two_wires
 
 PATIENCE_S = 10.0
