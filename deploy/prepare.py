@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from softloop.deploy.bench import Bench
+from softloop.deploy.envelope import check_envelope
 from softloop.wire.errors import EXIT_LOST, BadConfig, Interrupted, SoftloopError
 from softloop.wire.shell import Stop
 
@@ -60,13 +61,15 @@ def check_controller(bench: Bench) -> float:
     """Build the controller without running it; returns its trajectory's length in s, 0 when the bench has none.
 
     Raises:
-        BadFile, BadConfig: its parameter file or trajectory is wrong or not feasible.
+        BadFile, BadConfig: its parameter file or trajectory is wrong, not feasible, or beyond the gate's limits.
     """
     if bench.controller is None:
         return 0.0
     from softloop.controller.setup import build  # noqa: PLC0415 - it brings numba and scipy: only where it is needed
 
-    return build(bench.controller).plan.duration_s
+    controller = build(bench.controller)
+    check_envelope(bench, controller)
+    return controller.plan.duration_s
 
 
 def prepare(bench: Bench, run_dir: Path, progress: Progress) -> Prepared:

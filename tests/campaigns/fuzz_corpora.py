@@ -23,6 +23,7 @@ MORE_BENCHES = (
     b'name = "x"\n[can.can0]\n[plant]\n[[plant.faults]]\nkind = "chamber_bias"\non_s = 1\noff_s = 2\nsize = 3\n',
     b'name = "x"\n[hosts.a]\naddress = "127.0.0.2"\n[hosts.b]\n[recorder]\nhost = "a"\n[controller]\nhost = "b"\n',
     b'name = "x"\n[zenoh]\nmode = "client"\nendpoint = "tls/10.0.0.1:7447"\n[zenoh.tls]\nfolder = "keys"\n',
+    b'name = "x"\n[zenoh]\nendpoint = "quic/10.0.0.1:7447"\n[zenoh.tls]\nfolder = "keys"\n',
 )
 EVIDENCE = '[evidence]\nrig="r"\nmethod="m"\nsoftloop="0"\nparameters=["a0"]\ncovariance=[[1.0]]\n[[evidence.runs]]\nname="a"\n'
 EVIDENCE += f'sha256="{"0" * 64}"\nstart_s=0\nend_s=1\nfit_percent=90\ntrained=true\n'
