@@ -86,7 +86,7 @@ def _all_sections(schema: dict[str, Any]) -> Iterator[Section]:
     for name, given in schema["properties"].items():
         model, heading = _table_in(given, name)
         if model:
-            yield from _sections(schema, model, heading, name)
+            yield from _sections(schema, model, heading, heading.strip("[]"))
 
 
 def _sections(schema: dict[str, Any], model: str, heading: str, path: str) -> Iterator[Section]:
