@@ -1,4 +1,4 @@
-"""What Zenoh is told: explicit endpoints, no scouting, timeouts, and queues that never make the 5 ms path wait."""
+"""What Zenoh is told: explicit endpoints, no scouting, timeouts, and that nothing waits for a slow reader."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ CLIENT_PATIENCE_MS = 10_000
 # How long a link may take to come about. A packet of its opening that a network loses is sent again after 1 s, and after 2 s
 # more; and a direct link to a peer is tried once.
 OPENING_MS, OPENING_FAR_MS = 1000, 5000
-DATAGRAM_BATCHES = 16  # as many as Zenoh allows
 
 
 def make_config(
@@ -72,18 +71,7 @@ def settings_of(
         "timestamping/enabled": False,
         "adminspace/enabled": False,
     }
-    return (identity.settings if identity else {}) | _queues(listen + connect) | told
-
-
-def _queues(endpoints: list[str]) -> dict[str, Any]:
-    """How much may wait for a link.
-
-    One that takes datagrams is handed batches of one datagram, some 1.2 kB and not 64: two of them, Zenoh's default, are full
-    after a dozen messages each, and what finds them full is dropped.
-    """
-    if not any(endpoint.startswith(QUIC) for endpoint in endpoints):
-        return {}
-    return {f"transport/link/tx/queue/size/{priority}": DATAGRAM_BATCHES for priority in ("real_time", "data")}
+    return (identity.settings if identity else {}) | told
 
 
 def _locator(endpoint: str) -> str:
