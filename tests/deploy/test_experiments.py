@@ -14,11 +14,13 @@ from softloop.deploy.bench import find_bench, load_bench
 from softloop.deploy.experiments import Experiments
 
 TOY = """
-import signal, sys, time
+import pathlib, signal, sys, time
 print("running", flush=True)
 signal.signal(signal.SIGINT, lambda *_: (print("softloop: interrupted (SIGINT)", flush=True), sys.exit(130)))
 print(open(sys.argv[2]).read().replace(chr(10), "|"), flush=True)
-time.sleep(30 if "duration" not in open(sys.argv[2]).read() else 0.2)
+end = time.monotonic() + 30
+while time.monotonic() < end and not pathlib.Path(sys.argv[0]).with_name("enough").exists():
+    time.sleep(0.02)
 print("run: runs/toy", flush=True)
 """
 
@@ -36,11 +38,12 @@ def start(runs, **asked):
     return asyncio.run(runs.start(asked))
 
 
-def test_a_run_is_started_with_what_was_asked_and_its_end_is_told(runs, monkeypatch):
+def test_a_run_is_started_with_what_was_asked_and_its_end_is_told(runs, tmp_path):
     told = []
     runs.on_change = lambda: told.append(runs.state()["text"])
     assert start(runs, law="pid", trajectory="t2", duration_s=5) == {}
     assert "error" in start(runs, law="arc")
+    (tmp_path / "enough").touch()
     until(lambda: runs.state()["text"].startswith("ended with code 0: run: runs/toy"))
     assert runs.state() | {"text": ""} == {"running": False, "text": "", "law": "pid", "trajectory": "t2"}
     assert told[0] == "starting"
