@@ -196,9 +196,9 @@ def test_a_stop_is_said_up_to_the_very_look_that_finds_the_gate_in_fault(monkeyp
     monkeypatch.setattr(requests, "STOP_FOR_S", 3600.0)  # it does not give up by itself
     line, sent, newest = StopLine(), [], deque()
     line._requester, line._valves = SimpleNamespace(send=sent.append), SimpleNamespace(take=newest.popleft)
-    for _ in range(2):
-        newest.extend([None, heard_of(1), b"no status", heard_of(2)])  # one for each look
-        assert line.press()
-        until(lambda: not newest)
+    newest.extend([None, heard_of(1), b"no status", heard_of(2), None])  # one for each look
+    assert line.press()
+    until(lambda: len(newest) == 1)
+    time.sleep(10 * requests.STOP_REPEAT_S)  # time enough to look again
     line.close()
-    assert sent == ["stop"] * 8  # at each press and after each look but the last
+    assert (sent, list(newest)) == (["stop"] * 4, [None])  # at the press and after each look but the last
