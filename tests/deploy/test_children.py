@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from softloop.deploy import children as module
 from softloop.deploy.children import Children
 from softloop.wire.errors import EXIT_LOST
 
@@ -72,8 +73,25 @@ def test_a_child_that_is_killed_counts_as_lost(children, tmp_path):
     assert "killed by SIGKILL" in child.epitaph()
 
 
-def test_stop_asks_first_and_kills_only_the_deaf(children, tmp_path):
+class Naps:
+    """A clock that counts how long it was slept, with `meanwhile` for what happens in each sleep."""
+
+    def __init__(self, meanwhile):
+        self.now_s, self.meanwhile = 0.0, meanwhile
+
+    def monotonic(self):
+        return self.now_s
+
+    def sleep(self, seconds):
+        time.sleep(seconds)
+        self.meanwhile()
+        self.now_s += seconds
+
+
+def test_stop_asks_first_and_kills_only_the_deaf(children, tmp_path, monkeypatch):
     polite, deaf = start(children, tmp_path, "polite"), start(children, tmp_path, "deaf")
+    # How long the polite one takes to end is this machine's affair: for it, time stands still.
+    monkeypatch.setattr(module, "time", Naps(lambda: deaf.killed and polite.popen.wait(30)))
     killed = children.stop((("deaf",), ("polite",)), timeout_s=0.3)
     assert killed == [deaf]
     assert polite.exit_code() == 0

@@ -59,12 +59,17 @@ def dictionary(outputs, rpdo, without=(), measured=0):
 
 
 class Module:
-    """Runs from its making to `close`. `counts` are what its outputs give now, by sub-index."""
+    """Runs from its making to `close`. `counts` are what its outputs give now, by sub-index.
+
+    Attributes:
+        clock: gives the time that it goes by, s. `looks` counts how often it looked whether a deadline has passed.
+    """
 
     def __init__(self, bus, node_id=1, outputs=(1, 2), rpdo=2, shift=16, without=(), measured=0):
         self.outputs, self.rpdo, self.shift, self.measured = outputs, rpdo, shift, measured
         self.without = without
         self.counts = dict.fromkeys(outputs, 0)
+        self.clock, self.looks = time.monotonic, 0
         self.in_error, self.stored = False, 0
         self.vented_at = 0.0
         self.network = canopen.Network(bus)
@@ -105,7 +110,7 @@ class Module:
             self.network.notify(message.arbitration_id, message.data, message.timestamp)
             consumer = 0 if 0x1016 in self.without else self.held(0x1016, 1)
             if message.arbitration_id == 0x700 + (consumer >> 16) and consumer & 0xFFFF:
-                self.heartbeat_at = time.monotonic()
+                self.heartbeat_at = self.clock()
             identifier = self.held(0x1400 + self.rpdo - 1, 1)
             if message.arbitration_id == identifier and self.node.nmt.state == OPERATIONAL:
                 self.take(bytes(message.data))
@@ -117,13 +122,14 @@ class Module:
             entry = self.held(mapping, i + 1)
             assert (entry >> 16, entry & 0xFF) == (0x6411, 16)
             self.counts[entry >> 8 & 0xFF] = struct.unpack_from("<h", data, 2 * i)[0]
-        self.pdo_at, self.in_error = time.monotonic(), False
+        self.pdo_at, self.in_error = self.clock(), False
 
     def watch(self):
         while not self.ending:
             time.sleep(POLL_S)
             with self.lock:
-                self.look(time.monotonic())
+                self.look(self.clock())
+                self.looks += 1
 
     def look(self, now):
         deadline = 0 if 0x1400 + self.rpdo - 1 in self.without else self.held(0x1400 + self.rpdo - 1, 5)
@@ -147,7 +153,7 @@ class Module:
         self.error_values()
 
     def error_values(self):
-        self.in_error, self.vented_at = True, time.monotonic()
+        self.in_error, self.vented_at = True, self.clock()
         for sub in self.outputs:
             if 0x6443 not in self.without and self.held(0x6443, sub) == 1:
                 self.counts[sub] = self.held(0x6444, sub) >> self.shift

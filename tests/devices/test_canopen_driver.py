@@ -2,12 +2,13 @@
 
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 
 import can
 import pytest
 
+from softloop.devices import canopen_node, valves
 from softloop.devices import gate as g
-from softloop.devices import valves
 from softloop.devices.canopen_node import talking
 from softloop.devices.protocols.canopen_output import required_settings
 from softloop.devices.valve_driver import make_driver
@@ -31,7 +32,9 @@ CURRENT = {"node_id": 9, "deadline_ms": 200, "gate_heartbeat_ms": 1000}
 
 def config(kind="canopen_analog", **node):
     given = {"canopen_analog": ANALOG, "canopen_current": CURRENT}[kind] | node
-    return process(driver=kind, **{kind: given}, **WIDE)
+    made = process(driver=kind, **{kind: given}, **WIDE)
+    # Two seconds, more than a bench may have: the controller is a thread of a busy test, and its silence is not what is tried.
+    return replace(made, valves=made.valves.model_copy(update={"hold_ticks": 400}))
 
 
 def plan_of(config):
@@ -66,6 +69,12 @@ class CanopenRig(Rig):
         while self.port.recv(0.0) is not None:
             pass
 
+    def silent_for(self, seconds):
+        """Let the module look at a time so long after the last receive PDO, however long that was on this machine."""
+        module, looked = self.module, self.module.looks
+        module.clock = lambda: module.pdo_at + seconds
+        self.until(lambda: module.looks > looked + 1)
+
     @property
     def currents(self):
         """(charge, exhaust) in mA, as the module gives them."""
@@ -75,7 +84,9 @@ class CanopenRig(Rig):
 
 @contextmanager
 def canopen_rig(meet, config, **how):
-    with bench(meet) as (a, b):
+    with bench(meet) as (a, b), pytest.MonkeyPatch.context() as patch:
+        # On a busy machine an answer may take longer; asked again, the node answers twice, and the next question gets the second.
+        patch.setattr(canopen_node, "_ANSWER_S", 10.0)
         rig = CanopenRig(b, config, **how)
         rig.wire_of_tool, rig.config, rig.wire_of_gate = a, config, a
         try:
@@ -99,10 +110,12 @@ def test_a_gate_that_dies_is_vented_by_the_module_itself(meet, tmp_path, kind):
                 rig.until(lambda: (rig.newest("charge_coil_ma"), rig.newest("exhaust_coil_ma")) == (100.0, 20.0))
             rig.module.listen, kept = lambda message: None, rig.module.listen
             rig.module.network.notifier.listeners[:] = []  # the cable to the module is cut
-            cut_at = time.monotonic()
+            rig.silent_for(0.199)
+            assert not rig.module.in_error
+            rig.silent_for(0.201)
             rig.until(lambda: rig.module.in_error)
             assert rig.currents == (0.0, 200.0)
-            assert rig.module.vented_at - cut_at < 0.2 + 0.1
+            rig.module.clock = time.monotonic
             rig.until(lambda: rig.events.find(kind=KIND_GATE, code=g.GATE_FAULT, reason=g.REASON_DRIVER_SILENT))
             assert rig.module.node.nmt.state == STOPPED
             rig.module.network.notifier.listeners[:] = [kept]  # and whole again: no re-arming by itself

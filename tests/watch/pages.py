@@ -83,8 +83,8 @@ class ToyRig:
         cycle |= {"chamber_pressure_kpa": 40.0 + i % 10, "desired_pressure_kpa": 42.0, "supply_pressure_kpa": 198.5}
         cycle |= {"charge_current_ma": 80.0, "exhaust_current_ma": 50.0, "trajectory_ns": i * 5_000_000, "adapting": 1}
         cycle |= {"pressure_age_ns": 3_400_000, "inclination_age_ns": 4_900_000}
+        self.cycles.append(cycle)  # before it is sent: whoever has seen it finds it here
         self.speaker.say("cycle", **cycle, theta=tuple(float(k) for k in range(14)))
-        self.cycles.append(cycle)
         reason = EMERGENCY if self.gate == STATES["stop"] else 0
         self.speaker.say("valves", seq=i + 1, stamp_ns=now_ns, gate=self.gate, output=int(self.gate == 1), reason=reason)
         for arbitration_id in (0x80, 0x90, 0x100):

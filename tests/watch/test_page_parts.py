@@ -4,20 +4,24 @@ import asyncio
 import json
 import struct
 import time
+from collections import deque
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from softloop.watch.config import PageConfig
 from softloop.watch.overview import Overview
+from softloop.watch.page import requests
 from softloop.watch.page.access import Access, read_token
 from softloop.watch.page.history import COLUMNS, History
-from softloop.watch.page.requests import ask
+from softloop.watch.page.requests import StopLine, ask
 from softloop.watch.page.state import as_json, events_of, state_of
 from softloop.wire.benchfile import load_model
 from softloop.wire.channels import CYCLE, EVENT, VALVES, key
 from softloop.wire.errors import BadConfig, BadFile
 from softloop.wire.messages import message
+from tests.watch.pages import until
 
 START_NS = 10**12
 
@@ -181,3 +185,20 @@ class Gate:
 def test_asking_the_gate(gate, action, obeyed, asked):
     assert asyncio.run(ask(gate.send, gate.look, action)) is obeyed
     assert len(gate.asked) == asked
+
+
+def heard_of(gate):
+    kind = message("ValveStatus")
+    return kind.pack(kind.make(seq=1, gate=gate))
+
+
+def test_a_stop_is_said_up_to_the_very_look_that_finds_the_gate_in_fault(monkeypatch):
+    monkeypatch.setattr(requests, "STOP_FOR_S", 3600.0)  # it does not give up by itself
+    line, sent, newest = StopLine(), [], deque()
+    line._requester, line._valves = SimpleNamespace(send=sent.append), SimpleNamespace(take=newest.popleft)
+    newest.extend([None, heard_of(1), b"no status", heard_of(2), None])  # one for each look
+    assert line.press()
+    until(lambda: len(newest) == 1)
+    time.sleep(10 * requests.STOP_REPEAT_S)  # time enough to look again
+    line.close()
+    assert (sent, list(newest)) == (["stop"] * 4, [None])  # at the press and after each look but the last

@@ -88,6 +88,14 @@ class Bench:
     def put(self, full_key, payload):
         self.guest.session.put(full_key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
+    def handed_over(self):
+        """Wait until all that was put has reached the recorder's session: what is put later by the same way has."""
+        heard = threading.Event()
+        handler = zenoh.handlers.Callback(lambda _: heard.set(), indirect=False)
+        marker = self.context.wire.session.declare_subscriber("marker", handler)
+        self.until(lambda: self.put("marker", b"") or heard.is_set())
+        marker.undeclare()
+
     def stop(self):
         self.context.stop.set("test")
         self.thread.join(END_S)
@@ -161,7 +169,6 @@ def test_a_backlog_drops_the_oldest_and_says_so_in_the_log(tmp_path, monkeypatch
     gate.set()
     with Bench(tmp_path, backlog_messages=10) as bench:
         events = bench.guest.inbox(EVENT)
-        witness = bench.guest.inbox(PRESSURE)
         take = bench.recorder.take
 
         def take_when_let():
@@ -177,8 +184,7 @@ def test_a_backlog_drops_the_oldest_and_says_so_in_the_log(tmp_path, monkeypatch
         assert entered.wait(END_S)
         for seq in range(2, 52):
             bench.put(key(BENCH, PRESSURE), pressure(seq))
-        bench.until(lambda: witness.take() and not witness.take(0.3))
-        time.sleep(0.3)  # it reached the guest; the recorder hears of it by a way of the same length
+        bench.handed_over()
         gate.set()
         bench.until(events.take)
         bench.stop()
