@@ -14,10 +14,17 @@ from typing import Any, Literal
 
 import tomlkit
 
+from softloop.controller.config import ControllerConfig
 from softloop.deploy.bench import Bench, load_bench
+from softloop.wire.benchfile import read_toml
 from softloop.wire.errors import EXIT_OK, BadConfig, Unavailable
 
 Pace = Literal["wall", "lockstep", "batch"]
+
+# Keys of [controller] that say what a rig is like, and not how a law is tuned.
+OF_THE_RIG = (
+    "actuation_delay_ms", "pressure_delay_ms", "inclination_delay_ms", "pressure_budget_ms", "inclination_budget_ms",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -85,6 +92,16 @@ def run_one(place: Place, name: str, changes: Mapping[str, Any]) -> int:
     from softloop.deploy.launcher import Options, launch  # noqa: PLC0415 - likewise Zenoh
 
     return launch(file, Options(run_dir=target, quiet=quiet, pace=place.asked.pace, report=report))
+
+
+def gains_of(law: str, own: ControllerConfig | None) -> dict[str, Any]:
+    """The [controller] table of a law's tuned gains, empty where it has none; what a bench's `own` states of its rig stays."""
+    from softloop.offline.evaluation import tuned_file  # noqa: PLC0415 - it brings the kernels
+
+    file = tuned_file(law)
+    gains = read_toml(file)["controller"] if file.is_file() else {}
+    stated = own.model_fields_set if own else set()
+    return {key: value for key, value in gains.items() if key not in OF_THE_RIG or key not in stated}
 
 
 def bench_file(place: Place, name: str, changes: Mapping[str, Any]) -> Path:

@@ -14,16 +14,14 @@ from rich.table import Table
 
 from softloop.controller.config import ControllerConfig
 from softloop.controller.references import EXCITATION_SPAN_KPA
-from softloop.deploy.experiment import Asked, Place, begin, run_all
+from softloop.deploy.experiment import Asked, Place, begin, gains_of, run_all
 from softloop.deploy.progress import counted_progress
 from softloop.deploy.tune import seeds_of
 from softloop.offline.closed_loop import simulate_run
-from softloop.offline.evaluation import tuned_file
 from softloop.offline.excitation import BAR_KPA, PressureTracking, pressure_tracking, run_tracking
 from softloop.offline.run_log import open_run
 from softloop.offline.tuning import EXCITATION_APPROACH_S
 from softloop.plant.config import PlantConfig
-from softloop.wire.benchfile import read_toml
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
 
 # Name of the run's directory -> what the paper calls it, and its band.
@@ -36,7 +34,7 @@ def run_pressure(asked: Asked, law: str) -> int:
     """Excite, judge, draw; EXIT_NEGATIVE where the pressure was off by more than BAR_KPA. Raises as `softloop run` does."""
     place = begin(asked, "pressure")
     check_envelope(place)
-    code = run_all(place, {name: {"controller": controller_of(law, name)} for name in RUNS})
+    code = run_all(place, {name: {"controller": controller_of(law, name, place.bench.controller)} for name in RUNS})
     if code != EXIT_OK:
         return code
     found = judge(place.folder)
@@ -45,11 +43,9 @@ def run_pressure(asked: Asked, law: str) -> int:
     return EXIT_OK if all(run.kept for run in found.values()) else EXIT_NEGATIVE
 
 
-def controller_of(law: str, trajectory: str) -> dict[str, Any]:
+def controller_of(law: str, trajectory: str, own: ControllerConfig | None) -> dict[str, Any]:
     """The [controller] table of an excitation: the law with its tuned gains where it has some."""
-    file = tuned_file(law)
-    gains = read_toml(file)["controller"] if file.is_file() else {}
-    return {**gains, "law": law, "trajectory": trajectory, "approach_s": EXCITATION_APPROACH_S}
+    return {**gains_of(law, own), "law": law, "trajectory": trajectory, "approach_s": EXCITATION_APPROACH_S}
 
 
 def check_envelope(place: Place) -> None:
@@ -113,7 +109,7 @@ def over_rigs(law: str, seeds: Sequence[int], plant: PlantConfig, progress: Call
     for done, seed in enumerate(seeds):
         progress(done, len(seeds))
         for name, errors in found.items():
-            controller = ControllerConfig.model_validate(controller_of(law, name))
+            controller = ControllerConfig.model_validate(controller_of(law, name, None))
             run = simulate_run(controller, plant.model_copy(update={"seed": seed}))
             errors.append(run_tracking(run, controller.actuation_delay_ms).max_kpa if run.completed else inf)
     progress(len(seeds), len(seeds))

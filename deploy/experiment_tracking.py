@@ -9,12 +9,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from softloop.controller.config import ControllerConfig
 from softloop.controller.records import ANGLE_LAWS
-from softloop.deploy.experiment import Asked, Place, begin, run_all
-from softloop.offline.evaluation import tuned_file
+from softloop.deploy.experiment import Asked, Place, begin, gains_of, run_all
 from softloop.offline.run_log import open_run
 from softloop.offline.summary import PAPER_T1, PAPER_T2, shown, summarise
-from softloop.wire.benchfile import read_toml
 from softloop.wire.errors import EXIT_OK, BadConfig
 
 TRAJECTORIES = ("t1", "t2")
@@ -41,7 +40,9 @@ def run_tracking(asked: Asked, laws: Sequence[str], *, own_gains: bool) -> int:
     check_laws(laws)
     place = begin(asked, "tracking")
     names = {f"{law}_{trajectory}": (law, trajectory) for law in laws for trajectory in TRAJECTORIES}
-    runs = {name: {"controller": controller_of(*pair, own_gains=own_gains)} for name, pair in names.items()}
+    runs = {
+        name: {"controller": controller_of(*pair, place.bench.controller, own_gains=own_gains)} for name, pair in names.items()
+    }
     code = run_all(place, runs)
     if code != EXIT_OK:
         return code
@@ -57,10 +58,9 @@ def check_laws(laws: Sequence[str]) -> None:
         raise BadConfig(f"--laws '{','.join(laws)}': tracking is for {', '.join(ANGLE_LAWS)}")
 
 
-def controller_of(law: str, trajectory: str, *, own_gains: bool) -> dict[str, Any]:
+def controller_of(law: str, trajectory: str, own: ControllerConfig | None, *, own_gains: bool) -> dict[str, Any]:
     """The [controller] table of a run."""
-    file = tuned_file(law)
-    gains = read_toml(file)["controller"] if file.is_file() and not own_gains else {}
+    gains = {} if own_gains else gains_of(law, own)
     return {**gains, "law": law, "trajectory": trajectory}
 
 

@@ -33,10 +33,23 @@ def test_a_runs_bench_is_the_bench_with_another_law_and_nothing_else(tmp_path):
     for name in ("sim", "real"):
         shipped = find_bench(Path(name))
         place = begin(Asked(shipped, tmp_path / name), "pressure")
-        file = bench_file(place, "excitation_1hz", {"controller": controller_of("pressure", "excitation_1hz")})
+        file = bench_file(
+            place, "excitation_1hz", {"controller": controller_of("pressure", "excitation_1hz", place.bench.controller)}
+        )
         made, base = load_bench(file).model_dump(), load_bench(shipped).model_dump()
         assert (made["controller"]["law"], made["controller"]["trajectory"]) == ("pressure", "excitation_1hz")
         assert made | {"controller": None} == base | {"controller": None}
+
+
+def test_what_a_bench_states_of_its_rig_is_not_the_tuned_gains(tmp_path):
+    """A rig's lags and budgets are its own; where its bench says nothing of them, those hold that the law was tuned with."""
+    stated = "pressure_budget_ms = 100.0\nactuation_delay_ms = 9.0\n"
+    place = begin(Asked(bench_with(tmp_path, f"[controller]\n{stated}"), tmp_path / "x"), "pressure")
+    table = {"controller": controller_of("pressure_eso", "excitation_1hz", place.bench.controller)}
+    made = load_bench(bench_file(place, "one", table)).controller
+    assert (made.pressure_budget_ms, made.actuation_delay_ms, made.inclination_budget_ms) == (100.0, 9.0, 30.0)
+    assert made.observer.teach_kpa == 60.0
+    assert controller_of("pressure_eso", "excitation_1hz", None)["actuation_delay_ms"] == 1.412
 
 
 def test_parameters_and_seed_of_the_command_reach_the_run(tmp_path):
