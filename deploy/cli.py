@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from softloop.deploy.cli_app import EXIT_CODES, BenchArgument, OptionalBench, RunArgument, RunDir, app, log_app
+from softloop.deploy.interrupts import careful_interrupts
 from softloop.wire.errors import EXIT_LOST, EXIT_OK, EXIT_USAGE, BadConfig, SoftloopError
 
 
@@ -344,7 +345,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _run(arguments: list[str]) -> int:
     try:
-        code = app(arguments, standalone_mode=False)
+        with careful_interrupts():
+            code = app(arguments, standalone_mode=False)
     except SoftloopError as error:
         return _complain(str(error), error.exit_code)
     except BrokenPipeError:

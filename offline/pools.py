@@ -13,9 +13,8 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+from multiprocessing import forkserver, get_context, parent_process, resource_tracker
 from multiprocessing.connection import wait as wait_for
-from multiprocessing.forkserver import ensure_running
 from typing import Any
 
 from softloop.offline.campaign import Case, Result, run_case, run_cases
@@ -45,8 +44,9 @@ def run_in_processes(tables: RigTables, cases: Sequence[Case], jobs: int) -> Ite
     """In `jobs` processes. They come from a fork server that has loaded the kernels once. Raises Lost when one of them dies."""
     context = get_context("forkserver")
     context.set_forkserver_preload([__name__])
-    with _interrupts_ignored():  # inherited: Ctrl-C reaches the whole group, and the parent ends its workers
-        ensure_running()
+    resource_tracker.ensure_running()  # else that of the fork server does it, and lets interrupts through from then on
+    with _interrupts_blocked():  # inherited: Ctrl-C reaches the whole group, and the parent ends its workers
+        forkserver.ensure_running()
     pool = ProcessPoolExecutor(jobs, context, initializer=_begin_worker)
     try:
         waiting, under_way = iter(chunks(cases)), set[Future[list[Result]]]()
@@ -55,7 +55,7 @@ def run_in_processes(tables: RigTables, cases: Sequence[Case], jobs: int) -> Ite
             under_way -= done
             for future in done:
                 yield from future.result()
-    except BrokenProcessPool:
+    except (BrokenProcessPool, EOFError, ConnectionError):  # of a worker, of the fork server
         raise Lost("a worker process ended by itself; what is done is lost with it") from None
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
@@ -71,12 +71,13 @@ def _hand_out(
 
 
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _interrupts_blocked() -> Iterator[None]:
+    """Ctrl-C stays pending for this thread meanwhile; what is started keeps it blocked."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin_worker() -> None:

@@ -204,11 +204,14 @@ def test_json_is_all_of_standard_output(short, tmp_path):
     assert done.stderr == ""
 
 
-def test_ctrl_c_ends_the_command_and_its_workers(tmp_path):
+@pytest.mark.parametrize(
+    ("begun", "used_s"), [(1, 0.0), (1, 1.0), (2, 0.3)], ids=["helper begun", "fork server loads", "worker at work"]
+)
+def test_ctrl_c_ends_the_command_and_its_workers(tmp_path, begun, used_s):
     command = [sys.executable, "-m", "softloop.deploy.cli", "batch", "sim", "--seeds", "0:5000", "--jobs", "2", "--out", tmp_path]
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True) as child:
         try:
-            workers = _wait_for_workers(child.pid)
+            workers = _wait_for_workers(child.pid, begun, used_s)
             os.killpg(child.pid, signal.SIGINT)
             _, said = child.communicate(timeout=60)
         finally:
@@ -218,14 +221,14 @@ def test_ctrl_c_ends_the_command_and_its_workers(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def _wait_for_workers(pid, wanted=3, timeout_s=60.0):
-    """The command's processes once its fork server and a worker are there and at work."""
+def _wait_for_workers(pid, wanted, used_s, timeout_s=60.0):
+    """The command's processes (fork server, resource tracker, workers) once so many of them have used so much processor time."""
     end = time.monotonic() + timeout_s
     while time.monotonic() < end:
         children = psutil.Process(pid).children(recursive=True)
-        if len(children) >= wanted and any(c.cpu_times().user > 1.0 for c in children):
+        if sum(c.cpu_times().user >= used_s for c in children) >= wanted:
             return children
-        time.sleep(0.1)
+        time.sleep(0.01)
     raise AssertionError("no worker came")
 
 
