@@ -160,7 +160,7 @@ class Launch:
         self.meeting = Meeting(wire, watched=watched, say=view.say, tell=events.router, tell_host=events.host)
         self.keeper = Keeper(view.say, events.process)
         self.words: dict[str, str] = {}
-        self.all_alive = False
+        self.all_alive = self.arm_asked = False
         self.injector = Injector(bench, run_dir, events, children, self._start_killed, self.fleet.clock)
 
     def looking_after(self, viewers: Iterable[Kept], router: OwnRouter | None = None) -> Self:
@@ -264,6 +264,7 @@ class Launch:
 
     def _arm(self) -> Outcome | None:
         self.stop.wait(self.bench.run.settle_s)
+        self.arm_asked = True
         limit = self.bench.run.arm_timeout_s
         armed = ask(self.requests, self.state, "arm", limit, give_up=lambda: self._trouble() is not None, on_event=self.view.say)
         if armed:
@@ -285,9 +286,9 @@ class Launch:
             trouble = self._trouble()
             if trouble is not None:
                 return trouble
-            if self.state.done:
+            if self.state.done and not (self.meeting.excuses or self.meeting.awaits_arming):
                 return Outcome(EXIT_OK, "the trajectory is done")
-            if duration_s and time.monotonic() - began >= duration_s:
+            if duration_s and time.monotonic() - began >= duration_s and not self.meeting.excuses:
                 return Outcome(EXIT_OK, f"ended after {duration_s:g} s as asked")
             self.stop.wait(POLL_S)
 
@@ -337,22 +338,25 @@ class Launch:
         return Outcome(EXIT_LOST if self.all_alive else child.exit_code_for_a_person(), child.epitaph())
 
     def _vented(self, outcome: Outcome) -> Outcome:
-        """Disarm and wait until the chamber's pressure is gone, or not much longer."""
-        if not self.state.was_armed:  # the gate has vented by itself all the time
+        """Disarm, or FAULT for what was lost, and wait until the chamber's pressure is gone, or not much longer."""
+        lost = outcome.code == EXIT_LOST
+        if not (self.state.was_armed or (self.arm_asked and lost)):  # the gate has vented by itself all the time
             return outcome
         deadline = time.monotonic() + self.bench.run.vent_timeout_s
-        while time.monotonic() < deadline and not self._is_vented():
-            self.requests.send("disarm")
+        while time.monotonic() < deadline and not self._is_vented(lost=lost):
+            self.requests.send("stop" if lost else "disarm")
             self._refresh("venting")
             time.sleep(POLL_S)
-        if self._is_vented():
+        if self._is_vented(lost=lost):
             return outcome
         pressure = self.state.pressure
         left = "unknown" if pressure is None else f"{pressure.chamber_pressure_kpa:.1f} kPa"
-        return replace(outcome, text=f"{outcome.text}; the chamber was not vented in time, pressure {left}")
+        code = EXIT_LOST if outcome.code == EXIT_OK and self._gate_is_silent() else outcome.code
+        return replace(outcome, code=code, text=f"{outcome.text}; the chamber was not vented in time, pressure {left}")
 
-    def _is_vented(self) -> bool:
-        return not self.state.armed and self.state.vented(self.bench.run.vented_kpa)
+    def _is_vented(self, *, lost: bool) -> bool:
+        at_rest = self.state.gate == GATE_FAULT if lost else not self.state.armed
+        return at_rest and self.state.vented(self.bench.run.vented_kpa)
 
     def _stop_children(self) -> None:
         limit_s = self.bench.run.stop_timeout_s

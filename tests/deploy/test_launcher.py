@@ -108,6 +108,12 @@ def test_a_process_that_dies_while_running_is_lost_and_named(short_dir, name):
     outcome, _, _ = launch(short_dir, {"controller": "endless"} | {name: "dies_armed"})
     assert outcome.code == EXIT_LOST
     assert f"process '{name}' ended with code 7" in outcome.text
+    assert (short_dir / "asked").read_text() == "stop", "a lost process is a FAULT of the gate"
+
+
+def test_a_gate_that_froze_shortly_before_the_end_is_lost(short_dir):
+    outcome, _, _ = launch(short_dir, {"valves": "hangs_armed"})
+    assert outcome.code == EXIT_LOST, outcome.text
 
 
 def test_a_recorder_that_dies_is_started_again_and_the_run_goes_on(short_dir):
@@ -156,12 +162,18 @@ def test_a_deaf_process_is_killed_and_its_socket_removed(short_dir):
 
 
 def test_an_interrupt_disarms_and_stops(short_dir):
-    stop = Stop()
-    timer = threading.Timer(2.5, stop.set, ["SIGINT"])
-    timer.start()
+    stop, asked = Stop(), short_dir / "asked"
+
+    def interrupt():
+        wait_for(lambda: asked.exists() and asked.read_text() == "arm", 30.0)
+        stop.set("SIGINT")
+
+    person = threading.Thread(target=interrupt)
+    person.start()
     outcome, _, _ = launch(short_dir, {"controller": "endless"}, stop=stop)
-    timer.join()
-    assert (outcome.code, outcome.text) == (EXIT_INTERRUPTED, "interrupted (SIGINT)")
+    person.join()
+    assert outcome.code == EXIT_INTERRUPTED
+    assert outcome.text.startswith("interrupted (SIGINT)")
 
 
 def test_two_launchers_of_one_bench_are_refused():

@@ -79,13 +79,16 @@ class Gate(Idle):
         super().__init__(context, wrong)
         self.put = self.wire.publisher(VALVES)
         self.requests = self.wire.inbox(REQUEST, ARM)
+        self.asked = context.run_dir / "asked"
         self.gate = DISARMED
         self.reason = self.armed_steps = 0
 
     def step(self):
         super().step()
         for _, payload in self.requests.take_all():
-            self.gate = {0: DISARMED, 1: ARMED, 2: FAULT}[message("GateRequest").unpack(payload).action]
+            action = message("GateRequest").unpack(payload).action
+            self.gate = {0: DISARMED, 1: ARMED, 2: FAULT}[action]
+            self.asked.write_text({0: "disarm", 1: "arm", 2: "stop"}[action])
         if self.gate == ARMED and self.wrong == "faults":
             self.gate, self.reason = FAULT, STALE
         kind = message("ValveStatus")
