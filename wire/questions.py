@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from typing import Any
 
@@ -12,6 +13,10 @@ from softloop.wire.errors import BadConfig, Unavailable
 from softloop.wire.session import Wire
 
 WAITING_MAX = 16
+# Who has just begun to answer is known to others only after a while: on a busy machine one of 60 questions that followed at once
+# found nobody.
+BECOMING_KNOWN_S = 1.0
+_AGAIN_S = 0.05
 
 
 class Question:
@@ -61,15 +66,31 @@ def ask(wire: Wire, channel: Channel, payload: bytes, timeout_s: float) -> None:
     """
     if wire.identity is not None and not wire.identity.rights.may_ask(channel.name):
         raise wire.refused("ask on", channel)
+    refusals = _ask_who_is_known(wire, channel, payload, timeout_s)
+    if refusals is None:
+        return
+    words = [" ".join(words.split()) for words in refusals if words and words != "Timeout"]
+    if words:
+        raise BadConfig(words[0])
+    raise Unavailable(f"nothing of bench '{wire.bench}' answers on '{channel.name}'")
+
+
+def _ask_who_is_known(wire: Wire, channel: Channel, payload: bytes, timeout_s: float) -> list[str] | None:
+    """As `_ask_once`, again for a while as long as the network knows of nobody to ask."""
+    end = time.monotonic() + min(BECOMING_KNOWN_S, timeout_s)
+    while (refusals := _ask_once(wire, channel, payload, timeout_s)) == [] and time.monotonic() < end:
+        time.sleep(_AGAIN_S)
+    return refusals
+
+
+def _ask_once(wire: Wire, channel: Channel, payload: bytes, timeout_s: float) -> list[str] | None:
+    """The refusals, none where the network knows of nobody to ask; None when it is done."""
     replies = wire.session.get(
         key(wire.bench, channel), payload=payload, timeout=timeout_s, congestion_control=zenoh.CongestionControl.BLOCK
     )
     refusals = []
     for reply in replies:
         if reply.ok is not None:
-            return
+            return None
         refusals.append(reply.err.payload.to_bytes().decode(errors="replace") if reply.err else "")
-    words = [" ".join(words.split()) for words in refusals if words and words != "Timeout"]
-    if words:
-        raise BadConfig(words[0])
-    raise Unavailable(f"nothing of bench '{wire.bench}' answers on '{channel.name}'")
+    return refusals

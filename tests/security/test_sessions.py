@@ -200,6 +200,8 @@ def test_questions_are_the_operators_alone():
         plant = stack.enter_context(open_wire(at.bench.zenoh, NAME, "plant"))
         operator = stack.enter_context(open_wire(at.bench.zenoh, NAME, "request-fault"))
         assert operator.identity.name == "operator"
+        for wire in (plant, operator):
+            wire.settle(lambda: False)
         questions, stop, asked = Questions(plant, FAULT), threading.Event(), []
 
         def answer():
