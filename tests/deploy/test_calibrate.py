@@ -14,7 +14,7 @@ from softloop.devices.protocols.quantise import VOLTS_PER_COUNT
 from softloop.wire.errors import BadConfig, BadFile
 
 __all__ = ["folder"]
-SECONDS = ("--seconds", "0.8")
+SECONDS = ("--seconds", "1.6")  # twice what brings the samples that are needed: the machine may be busy
 
 
 class Analog(threading.Thread):
