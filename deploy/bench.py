@@ -298,7 +298,7 @@ def _remove(content: dict[str, Any], origins: dict[Key, Path], name: str, file: 
     for part in outer:
         table = table.get(part, {}) if isinstance(table, dict) else {}
     if not isinstance(table, dict) or last not in table:
-        raise BadConfig(f"{file}: key 'without': the base has no '{name}'; it has: {', '.join(sorted(content))}")
+        raise BadConfig(f"{file}: key 'without': the base has no '{name}'; it has: {', '.join(sorted(content)) or 'nothing'}")
     del table[last]
     gone = (*outer, last)
     for key in [k for k in origins if k[: len(gone)] == gone]:

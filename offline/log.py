@@ -23,11 +23,11 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata, Schema, Statistics
+from mcap.records import Channel, Chunk, Metadata, Schema, Statistics
 from numba import types
 from numpy.typing import NDArray
 
-from softloop.offline.mcap_walk import RECORD, FileRecords
+from softloop.offline.mcap_walk import RECORD, FileRecords, read_attachment
 from softloop.wire.channels import CAN, CHANNELS
 from softloop.wire.errors import BadFile
 from softloop.wire.kernel import array_of, kernel
@@ -270,10 +270,7 @@ class _Reader:
             self.topics[channel.id] = channel
 
     def _attachment(self, content: bytes) -> None:
-        attachment = Attachment.read(_stream(content))
-        (crc,) = struct.unpack("<I", content[-4:])
-        if crc and zlib.crc32(content[:-4]) != crc:
-            raise ValueError("checksum differs")
+        attachment = read_attachment(content)
         self.log.attachments[attachment.name] = attachment.data
 
     def _metadata(self, content: bytes) -> None:

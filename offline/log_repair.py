@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
+from mcap.records import Channel, Chunk, Header, Metadata, Schema
 
 from softloop.offline.log import DAMAGE, decompress, find_messages
-from softloop.offline.mcap_walk import RECORD, FileRecords, holds_chunk_mark
+from softloop.offline.mcap_walk import RECORD, FileRecords, holds_chunk_mark, read_attachment
 from softloop.wire.errors import BadFile, Unavailable
 from softloop.wire.log_parts import parts_of
 from softloop.wire.mcap_chunks import MAGIC, ChunkedWriter
@@ -138,7 +138,12 @@ class _Descriptions:
             Opcode.SCHEMA: self._schema,
             Opcode.CHANNEL: self._channel,
             Opcode.CHUNK: self._chunk,
+            Opcode.ATTACHMENT: self._attachment,
         }
+
+    def _attachment(self, body: bytes) -> None:
+        """Behind a damaged one the walk goes on as in the second reading, or the channels in it would be described nowhere."""
+        read_attachment(body)
 
     def _header(self, body: bytes) -> None:
         self.header = Header.read(_words(body))
@@ -203,10 +208,7 @@ class _Rewriter:
         return self._channel_numbers[key]
 
     def _attachment(self, body: bytes) -> None:
-        attachment = Attachment.read(_stream(body))
-        (crc,) = struct.unpack("<I", body[-4:])
-        if crc and zlib.crc32(body[:-4]) != crc:
-            raise ValueError("checksum differs")
+        attachment = read_attachment(body)
         if attachment.name not in self._attached:
             self._attached.add(attachment.name)
             self.writer.add_attachment(attachment.log_time, attachment.name, attachment.media_type, attachment.data)

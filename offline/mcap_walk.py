@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Iterator
+from io import BytesIO
 
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
+from mcap.records import Attachment
 
 from softloop.wire.mcap_chunks import MAGIC
 
@@ -66,11 +70,21 @@ class FileRecords:
     def damaged(self) -> None:
         """Where a chunk begins inside the record that came last, that record's length is wrong, and the chunk comes next.
 
-        Called for every record but attachments, which may hold anything; of those, the caller says which one is damaged.
+        Called for every record but attachments, which may hold anything; of those, the caller says which one is damaged. Who does
+        not, misses all that stands in one with a wrong length: whoever walks a file has to read its attachments.
         """
         found = next_chunk(self._view, self._record_at + 1, self.at)
         if found >= 0:
             self.at = found
+
+
+def read_attachment(body: bytes) -> Attachment:
+    """An attachment whose checksum, where it has one, is right. Raises ValueError, or what its parser raises on damage."""
+    attachment = Attachment.read(ReadDataStream(BytesIO(body)))
+    (crc,) = struct.unpack("<I", body[-4:])
+    if crc and zlib.crc32(body[:-4]) != crc:
+        raise ValueError("checksum differs")
+    return attachment
 
 
 def holds_chunk_mark(data: bytes) -> bool:

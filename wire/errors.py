@@ -11,9 +11,16 @@ EXIT_INTERRUPTED = 130
 
 
 class SoftloopError(Exception):
-    """Base of all errors meant for a person: `str(error)` is the one line to show."""
+    """Base of all errors meant for a person: `str(error)` is the one line to show.
+
+    What it quotes of a file or a payload may hold a line's end, a bell, half a character: such are shown as they would be written.
+    """
 
     exit_code = EXIT_USAGE
+
+    def __str__(self) -> str:
+        said = super().__str__()
+        return said if said.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in said)
 
 
 class BadFile(SoftloopError):

@@ -125,10 +125,11 @@ def guided(outcome, name, inputs, seed):
     # Instrumented functions are none that numba can compile; plain ones show their paths too.
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    runs = re.search(r"Done (\d+) runs", done.stderr)
-    outcome.count(f"inputs of {name}", int(runs.group(1)) if runs else 0)
-    if done.returncode or not runs:
-        said = [line for line in done.stderr.splitlines() if "Error" in line or "==" in line]
+    ended = re.search(r"Done (\d+) runs", done.stderr)
+    seen = re.findall(r"^#(\d+)", done.stderr, re.MULTILINE)  # at least so many, where it did not come to its end
+    outcome.count(f"inputs of {name}", int(ended.group(1)) if ended else max(map(int, seen), default=0))
+    if done.returncode or not ended:
+        said = [line for line in (done.stdout + done.stderr).splitlines() if "Error" in line or "written to" in line]
         outcome.fail(f"{name}: atheris ended with {done.returncode}: {' | '.join(said[:3])}")
 
 

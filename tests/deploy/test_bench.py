@@ -89,6 +89,7 @@ def write(folder, text, name="bench.toml"):
         (("[can.can0]", "base = 7\n[can.can0]"), "key 'base': must be the name of a bench file in quotes (got 7)"),
         (("[can.can0]", "without = 'plant'\n[can.can0]"), "key 'without': must be a list of table names in quotes"),
         (("[can.can0]", "without = ['plamt']\n[can.can0]"), "key 'without': the base has no 'plamt'"),
+        (("[can.can0]", 'without = ["pl\\nt"]\n[can.can0]'), r"key 'without': the base has no 'pl\nt'"),
         (("[can.can0]", "base = 'gone.toml'\n[can.can0]"), "key 'base': there is no file "),
         (("[can.can0]", "base = 'bench.toml'\n[can.can0]"), "key 'base': more than 8 files deep"),
     ],

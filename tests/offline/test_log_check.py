@@ -169,3 +169,16 @@ def test_a_chunk_amid_the_words_of_a_schema_is_not_taken_into_the_repaired_file(
     again = open_log(repair_log(file, tmp_path / "good.mcap").file)
     assert again.problems == []
     assert again.channels
+
+
+def test_what_stands_in_an_attachment_of_a_wrong_length_is_read_and_kept(tmp_path, made):
+    file = synthetic.write_log(tmp_path / "run.mcap", made[:40], chunk_bytes=600)
+    content = file.read_bytes()
+    records = [(opcode, at, len(body)) for opcode, at, body in FileRecords(memoryview(content))]
+    start = next(at for opcode, at, _ in records if opcode != 1)  # behind the header
+    end = max(at + 9 + n for opcode, at, n in records if opcode in {3, 4, 6})  # all that describes a channel is inside
+    file.write_bytes(content[:start] + b"\x09" + (end - start).to_bytes(8, "little") + content[start:])
+    damaged = open_log(file)
+    assert damaged.channels
+    again = open_log(repair_log(file, tmp_path / "good.mcap").file)
+    assert {name: len(r) for name, r in again.channels.items()} == {name: len(r) for name, r in damaged.channels.items()}
