@@ -13,7 +13,7 @@ EXIT_INTERRUPTED = 130
 class SoftloopError(Exception):
     """Base of all errors meant for a person: `str(error)` is the one line to show.
 
-    What it quotes of a file or a payload may hold a line's end, a bell, half a character: such are shown as they would be written.
+    What it quotes of a file or a payload may hold a line's end, a bell, half a character: these are shown as they are written.
     """
 
     exit_code = EXIT_USAGE
