@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from softloop.controller.setup import Controller
 
 _STEP_S = 0.01
+VENT_PART = 0.5  # of the flow at full current: then a chamber is empty within twice its shortest time
 
 
 def check_envelope(bench: Bench, controller: Controller) -> None:
@@ -20,6 +21,7 @@ def check_envelope(bench: Bench, controller: Controller) -> None:
     if bench.valves is None or bench.controller is None:
         return
     _check_current(bench, controller)
+    _check_vent(bench, controller)
     law = bench.controller.law
     if law == "valve_test":
         return
@@ -49,3 +51,23 @@ def _check_current(bench: Bench, controller: Controller) -> None:
             f"key 'valves.current_max_ma': the gate faults above {allowed_ma:g} mA, the controller saturates at {model_ma:g}, "
             f"[pneumatics] current_max_ma of its parameters '{bench.controller.parameters}'; make them agree"
         )
+
+
+def _check_vent(bench: Bench, controller: Controller) -> None:
+    """Venting empties the chamber: by the model the exhaust valve opens far enough, also where pressure holds it shut."""
+    from softloop.dynamics.pneumatics import pressure_rate  # noqa: PLC0415 - it brings numba: only where it is needed
+
+    assert bench.valves is not None
+    assert bench.controller is not None
+    gate, model = bench.valves, controller.model[0]
+    for pressure_kpa in (gate.vent_again_kpa, gate.pressure_max_kpa):
+        shut, vent, full = (
+            pressure_rate(model, model.theta, model.supply_kpa, pressure_kpa, 0.0, exhaust_ma)
+            for exhaust_ma in (0.0, gate.vent_current_ma, float(model.current_max_ma))
+        )
+        if shut - vent < VENT_PART * (shut - full):
+            raise BadConfig(
+                f"key 'valves.vent_current_ma': {gate.vent_current_ma:g} mA vents {pressure_kpa:g} kPa at {shut - vent:.0f} kPa/s "
+                f"by the model of '{bench.controller.parameters}'; full current does at {shut - full:.0f} kPa/s, and at least "
+                f"half of that is needed"
+            )

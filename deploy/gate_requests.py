@@ -34,7 +34,12 @@ class Requests:
         self._seqs = {REQUEST.name: 0, ARM.name: 0}
 
     def send(self, action: Action, stamp_ns: int | None = None) -> None:
-        """Publish one request, stamped now unless `stamp_ns` says when it is to hold (lockstep pace).
+        """Publish one request.
+
+        Args:
+            action: what is asked.
+            stamp_ns: to arm: the stamp of the gate's newest word, which this request answers; at lockstep pace: when the request
+                is to hold; else now.
 
         Raises Unavailable when this requester has no right to it.
         """
@@ -74,7 +79,7 @@ def ask(
         if time.monotonic_ns() - sent_ns >= REPEAT_NS:
             if sends and action == "arm" and state.gate == GATE_FAULT:
                 return False
-            requests.send(action)
+            requests.send(action, state.gate_stamp_ns if action == "arm" else None)
             sends, sent_ns = sends + 1, time.monotonic_ns()
         time.sleep(POLL_S)
     return False

@@ -65,7 +65,7 @@ def _said(found: LogCheck) -> Iterator[str]:
     for start, end in found.windows:
         yield f"loss window: {start:.3f} s to {end:.3f} s"
     if not found.finished:
-        yield f"loss window: {found.ends_s:.3f} s to the end of the run; the recorder did not end this file"
+        yield f"loss window: {found.ends_s:.3f} s to the end of the run; the recorder did not end its file"
 
 
 def _who(sender: int) -> str:

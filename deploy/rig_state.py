@@ -69,6 +69,11 @@ class RigState:
         return None if self.valves is None else self.valves.gate
 
     @property
+    def gate_stamp_ns(self) -> int:
+        """Of the gate's newest word, rig clock; 0 before its first one."""
+        return 0 if self.valves is None else int(self.valves.stamp_ns)
+
+    @property
     def armed(self) -> bool:
         return self.gate == GATE_ARMED
 

@@ -39,7 +39,7 @@ class ValvesConfig(ProcessTable):
     canopen_analog: CanopenAnalogConfig = CanopenAnalogConfig()
     canopen_current: CanopenCurrentConfig = CanopenCurrentConfig()
     current_max_ma: float = Field(220.0, gt=0, le=COUNTS_MAX * MA_PER_COUNT, description="above it a command is a fault")
-    slew_ma_per_tick: float = Field(220.0, gt=0, description="a passed current changes at most this much in one tick")
+    slew_ma_per_tick: float = Field(220.0, ge=1.0, description="a passed current changes at most this much in one tick")
     overlap_ma: float = Field(70.0, ge=0, description="one of the two currents is always held at or below this")
     vent_current_ma: float = Field(200.0, gt=0, description="exhaust current while venting")
     vent_done_kpa: float = Field(2.0, ge=0, description="venting ends at this chamber pressure")
@@ -47,7 +47,7 @@ class ValvesConfig(ProcessTable):
         0.5, ge=0, le=10, description="and has stayed below it for so long: gas that expanded cold warms up and rises again"
     )
     vent_again_kpa: float = Field(10.0, gt=0, description="and begins again above this one")
-    vent_time_s: float = Field(10.0, gt=0, description="or after this time, unless vent_again_kpa is seen")
+    vent_time_s: float = Field(10.0, ge=1.0, description="or after this time, unless vent_again_kpa is seen")
     pressure_max_kpa: float = Field(190.0, gt=0, description="chamber pressure; above it is a fault")
     angle_min_deg: float = Field(-20.0, description="below it is a fault")
     angle_max_deg: float = Field(200.0, description="above it is a fault")

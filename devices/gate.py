@@ -10,8 +10,8 @@ States and what leads where, as `NEXT` holds it. An event is what one step found
 
 - STOP: a stop request, of a person or of the monitor, held or not. DISARM: a request, or the process is about to end.
 - CONDITION: any of the reasons of `condition`: no arming while one holds, and FAULT when it comes up while armed.
-- ARM: an arm request that was not seen before (a new number of its requester). It is used up by the step that sees it: one
-  that was refused has to be made anew.
+- ARM: an arm request that was not seen before (a new number of its requester) and answers a word that this gate said less than
+  `ARM_AGE_NS` ago. It is used up by the step that sees it: one that was refused has to be made anew.
 
 Outputs: ARMED passes the command's currents, limited. DISARMED and FAULT vent (charge 0, exhaust at its open current) until
 the chamber is known to be empty or a time limit has passed, then close both valves; they vent again when pressure is seen to
@@ -56,6 +56,7 @@ REASON_REQUEST = _word("REASON_REQUEST")
 REASON_NOT_READY = _word("REASON_NOT_READY")
 REASON_SHUTDOWN = _word("REASON_SHUTDOWN")
 REASON_INVARIANT = _word("REASON_INVARIANT")
+REASON_OLD_REQUEST = _word("REASON_OLD_REQUEST")
 DRIVER_OK, DRIVER_WATCHDOG, DRIVER_SILENT = _word("DRIVER_OK"), _word("DRIVER_WATCHDOG"), _word("DRIVER_SILENT")
 
 EVENT_STOP, EVENT_CONDITION, EVENT_DISARM, EVENT_ARM, EVENT_NOTHING = range(5)
@@ -71,7 +72,9 @@ NEXT = np.array(
 STOP_ASKED, STOP_INVARIANT = 1, 2  # bits of `stop`: an emergency stop, and a fault asked for by the monitor
 
 LATE_COMMANDS = 40  # a command so many numbers behind the last one came late by another way; farther behind, another counts
-REQUESTERS = 8  # whose last arm request is remembered; of more, the one heard first is forgotten
+# A request that a network held back must not arm the rig when nobody asks any more; on this clock, whatever the requester's says.
+ARM_AGE_NS = 1_000_000_000
+REQUESTERS = 8  # whose last arm request is remembered, each at least for ARM_AGE_NS: what is forgotten is too old to arm
 
 GATE_CONFIG = record_dtype([
     ("silence_ns", _I8),            # a command is due every period; when none came for this long, it is silent
@@ -108,6 +111,7 @@ GATE_INPUT = record_dtype([
     ("arm", _I8),                   # 1: an arm request came, of this requester and number
     ("arm_origin", _I8),
     ("arm_seq", _I8),
+    ("arm_stamp_ns", _I8),          # of the gate's word that it answers
     ("shutdown", _I8),              # 1: the process is about to end
     ("bus_off", _I8),
     ("driver", _I8),                # ValveStatus DRIVER_* of the last good status frame
@@ -132,7 +136,8 @@ GATE_STATE = record_dtype([
     ("exhaust_ma", _F8),
     ("arm_origin", _I8, (REQUESTERS,)),
     ("arm_seq", _I8, (REQUESTERS,)),
-    ("requesters", _I8),            # how many were heard
+    ("arm_heard_ns", _I8, (REQUESTERS,)),
+    ("requesters", _I8),            # how many are remembered
 ])  # fmt: skip
 
 GATE_OUTPUT = record_dtype([
@@ -234,24 +239,30 @@ def condition(config: Any, state: Any, given: Any) -> int:
     return state.command_reason
 
 
-@kernel(types.b1(_STATE, types.i8, types.i8))
-def arm_is_new(state: Any, origin: int, seq: int) -> bool:
-    """Whether this arm request was not seen before; it is noted as seen."""
-    for i in range(min(state.requesters, REQUESTERS)):
+@kernel(types.b1(_STATE, types.i8, types.i8, types.i8))
+def arm_is_new(state: Any, origin: int, seq: int, now_ns: int) -> bool:
+    """Whether this arm request was not seen before; it is noted as seen. It is not taken where nobody can be forgotten for it."""
+    place = state.requesters
+    for i in range(state.requesters):
         if state.arm_origin[i] == origin:
             newer = seq > state.arm_seq[i]
-            state.arm_seq[i] = max(seq, state.arm_seq[i])
+            state.arm_seq[i], state.arm_heard_ns[i] = max(seq, state.arm_seq[i]), now_ns
             return newer
-    i = state.requesters % REQUESTERS
-    state.arm_origin[i], state.arm_seq[i] = origin, seq
-    state.requesters += 1
+        if state.requesters == REQUESTERS and (i == 0 or state.arm_heard_ns[i] < state.arm_heard_ns[place]):
+            place = i
+    if state.requesters < REQUESTERS:
+        state.requesters += 1
+    elif now_ns - state.arm_heard_ns[place] <= ARM_AGE_NS:
+        return False
+    state.arm_origin[place], state.arm_seq[place], state.arm_heard_ns[place] = origin, seq, now_ns
     return True
 
 
 @kernel(types.void(_CONFIG, _STATE, _INPUT, _OUTPUT))
 def change_state(config: Any, state: Any, given: Any, output: Any) -> None:
     """Find this step's event and go where the table says."""
-    asked = given.arm != 0 and arm_is_new(state, given.arm_origin, given.arm_seq)
+    late = given.arm != 0 and not 0 <= given.now_ns - given.arm_stamp_ns <= ARM_AGE_NS
+    asked = given.arm != 0 and not late and arm_is_new(state, given.arm_origin, given.arm_seq, given.now_ns)
     reason = condition(config, state, given)
     before, why_before = state.gate, state.reason
     event = EVENT_NOTHING
@@ -261,13 +272,15 @@ def change_state(config: Any, state: Any, given: Any, output: Any) -> None:
         event = EVENT_CONDITION
     elif given.shutdown != 0 or given.disarm != 0:
         event, reason = EVENT_DISARM, REASON_SHUTDOWN if given.shutdown != 0 else REASON_REQUEST
+    elif late:
+        reason = REASON_OLD_REQUEST
     elif asked:
         event = EVENT_ARM
     state.gate = NEXT[before, event]
     if state.gate != before or event == EVENT_STOP:
         state.reason = reason
     output.changed = state.gate != before or state.reason != why_before
-    output.refused = reason if asked and event != EVENT_ARM else REASON_NONE
+    output.refused = reason if asked or late else REASON_NONE  # of an event ARM it is REASON_NONE
     if state.gate != before and state.gate != GATE_ARMED:
         state.venting, state.vent_since_ns = 1, given.now_ns
 

@@ -6,6 +6,8 @@ valve frame, in the words of the driver that the bench file names. What happens 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from softloop.devices import gate as g
@@ -141,13 +143,20 @@ class ValvesLoop:
             given.stop |= _STOPS.get(request.action, 0)
             given.disarm |= request.action == _DISARM
             if request.action == _ARM:
-                given.arm, given.arm_origin, given.arm_seq = 1, request.origin & _INT63, request.seq & _INT63
+                self._take_arm(request)
         try:
             self._read_bus()
         except Lost as error:
             self.lost = error
         given.bus_off = self.lost is not None or self.port.bus_off or self.port.bus_offs != self.bus_offs
         self.bus_offs = self.port.bus_offs
+
+    def _take_arm(self, request: Any) -> None:
+        given = self.given
+        if given.arm:  # two at once: the step judges the last one, and the one before is used up too
+            g.arm_is_new(self.state, given.arm_origin, given.arm_seq, self.clock.now_ns())
+        given.arm, given.arm_origin, given.arm_seq = 1, request.origin & _INT63, request.seq & _INT63
+        given.arm_stamp_ns = request.stamp_ns
 
     def _read_bus(self) -> None:
         for _ in range(_FRAMES_AT_ONCE):

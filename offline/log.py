@@ -32,7 +32,7 @@ from softloop.wire.channels import CAN, CHANNELS
 from softloop.wire.errors import BadFile
 from softloop.wire.kernel import array_of, kernel
 from softloop.wire.mcap_chunks import MAGIC
-from softloop.wire.mcap_layout import METADATA_NAME, SCHEMA_ENCODING, Origin, split_topic
+from softloop.wire.mcap_layout import CUT_OFF_NAME, METADATA_NAME, SCHEMA_ENCODING, Origin, split_topic
 from softloop.wire.messages import CDR_HEADER, PACKAGE, MessageType, message
 
 Records = NDArray[Any]
@@ -62,7 +62,7 @@ class Log:
         attachments: name -> bytes.
         metadata: name -> text pairs.
         problems: what is damaged or missing, one line each; empty for a whole file.
-        finished: the recorder ended the file itself.
+        finished: the recorder ended the file itself, or the one that this one was repaired from.
     """
 
     path: Path
@@ -190,7 +190,7 @@ class _Reader:
     def _say_what_is_cut(self, records: FileRecords, size: int) -> None:
         for start, end in records.skipped:
             self._problem(f"{end - start} bytes from byte {start} on are no records, left out")
-        self.log.finished = records.finished
+        self.log.finished = records.finished and CUT_OFF_NAME not in self.log.metadata
         if not records.finished:
             left = size - records.at
             self._problem(f"the file was not finished or is cut off: it can be read up to byte {records.at}, {left} bytes follow")

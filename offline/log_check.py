@@ -67,8 +67,8 @@ class LogCheck:
 
     @property
     def whole(self) -> bool:
-        """Nothing is damaged and no number is missing."""
-        return not self.problems and not self.gaps
+        """Nothing is damaged, no number is missing, and the recorder saw the run's end."""
+        return self.finished and not self.problems and not self.gaps
 
     @property
     def missing(self) -> int:

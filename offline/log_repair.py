@@ -22,7 +22,7 @@ from softloop.offline.mcap_walk import RECORD, FileRecords, holds_chunk_mark, re
 from softloop.wire.errors import BadFile, Unavailable
 from softloop.wire.log_parts import parts_of
 from softloop.wire.mcap_chunks import MAGIC, ChunkedWriter
-from softloop.wire.mcap_layout import CHUNK_BYTES, LIBRARY, PROFILE
+from softloop.wire.mcap_layout import CHUNK_BYTES, CUT_OFF_NAME, LIBRARY, PROFILE
 
 KEPT_AS = ".damaged"
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
@@ -55,11 +55,10 @@ def repair_log(source: Path, target: Path | None = None) -> Repaired:
     if taken is not None:
         raise Unavailable(f"{taken}: is there already; move it away first")
     made = (source if target is None else target).with_name((target or source).name + ".partial")
-    contents, unread = _read_all(parts)
+    contents = _read_all(parts)
     try:
         with made.open("wb") as stream:
             found = _rewrite(contents, stream, target or source)
-            found.left_out += unread
             stream.flush()
             os.fsync(stream.fileno())
         for part, name in zip(parts, kept if target is None else [], strict=False):
@@ -72,17 +71,19 @@ def repair_log(source: Path, target: Path | None = None) -> Repaired:
     return found
 
 
-def _read_all(parts: list[Path]) -> tuple[list[memoryview], int]:
-    """What can be read of the parts, and how many cannot. Raises BadFile when none can."""
-    contents, unread = [], []
+def _read_all(parts: list[Path]) -> list[memoryview | None]:
+    """The parts; None for one that cannot be read. Raises BadFile when none can."""
+    contents: list[memoryview | None] = []
+    unread = []
     for part in parts:
         try:
             contents.append(_read(part))
         except BadFile as error:  # a recorder that was killed in its first moment
+            contents.append(None)
             unread.append(error)
-    if not contents:
+    if len(unread) == len(parts):
         raise unread[0]
-    return contents, len(unread)
+    return contents
 
 
 def _read(source: Path) -> memoryview:
@@ -96,23 +97,27 @@ def _read(source: Path) -> memoryview:
     return memoryview(mapped)
 
 
-def _rewrite(contents: list[memoryview], stream: Any, file: Path) -> Repaired:
+def _rewrite(contents: list[memoryview | None], stream: Any, file: Path) -> Repaired:
     rewriter: _Rewriter | None = None
-    found = Repaired(file)
+    found, ended = Repaired(file), False
     for content in contents:
+        if content is None:
+            found.left_out, ended = found.left_out + 1, False
+            continue
         described = _Descriptions()
         _each(content, described.handlers)
         if rewriter is None:
             rewriter = _Rewriter(stream, found, described.header)
         rewriter.take_descriptions(described)
-        found.left_out += _each(content, rewriter.handlers) + len(rewriter.lost_channels)
+        damaged, ended = _each(content, rewriter.handlers)
+        found.left_out += damaged + len(rewriter.lost_channels)
     if rewriter is not None:
-        rewriter.writer.finish()
+        rewriter.finish(ended=ended)
     return found
 
 
-def _each(content: memoryview, handlers: dict[int, Callable[[bytes], None]]) -> int:
-    """Give every record that has a handler to it; how many places are damaged."""
+def _each(content: memoryview, handlers: dict[int, Callable[[bytes], None]]) -> tuple[int, bool]:
+    """Give every record that has a handler to it; how many places are damaged, and whether the file has an end."""
     records, damaged = FileRecords(content), 0
     for opcode, _, body in records:
         handler = handlers.get(opcode)
@@ -123,7 +128,7 @@ def _each(content: memoryview, handlers: dict[int, Callable[[bytes], None]]) -> 
         except DAMAGE:
             damaged += 1
             records.damaged()
-    return damaged + len(records.skipped)
+    return damaged + len(records.skipped), records.finished
 
 
 class _Descriptions:
@@ -219,6 +224,12 @@ class _Rewriter:
         if metadata.name not in self._described:
             self._described.add(metadata.name)
             self.writer.add_metadata(metadata.name, metadata.metadata)
+
+    def finish(self, *, ended: bool) -> None:
+        """Write index and summary; where the recorder did not end the log, that too, for nothing else would show it any more."""
+        if not ended and CUT_OFF_NAME not in self._described:
+            self.writer.add_metadata(CUT_OFF_NAME, {})
+        self.writer.finish()
 
     def _message(self, body: bytes) -> None:
         channel_id, sequence, log_time, _ = _MESSAGE_HEAD.unpack_from(body)

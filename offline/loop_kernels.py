@@ -153,7 +153,7 @@ def hear_requests(link: Any, between: Any, now_ns: int) -> None:
     given = between.given
     given.stop, given.disarm, given.arm = 0, 0, 0
     if between.requests == 0 and link.arm_ns <= now_ns:
-        given.arm, given.arm_origin, given.arm_seq = 1, LAUNCHER_ORIGIN, 1
+        given.arm, given.arm_origin, given.arm_seq, given.arm_stamp_ns = 1, LAUNCHER_ORIGIN, 1, now_ns
         between.requests = 1
     if between.requests == 1 and link.disarm_ns <= now_ns:
         given.disarm = 1

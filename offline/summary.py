@@ -125,6 +125,12 @@ def evidence_problems(found: dict[str, Any]) -> list[str]:
     return [text for bad, text in checks if bad]
 
 
+def _problems(log: Log) -> list[str]:
+    if log.problems or log.finished:
+        return log.problems
+    return ["the log was repaired; its recorder did not end it, and what came after its last message is lost"]
+
+
 def _bench_tables(log: Log) -> dict[str, Any]:
     try:
         return tomllib.loads(log.text("bench.toml"))
@@ -183,7 +189,7 @@ def _latency(log: Log) -> dict[str, Value]:
 
 
 def _losses(log: Log) -> dict[str, Value]:
-    found: dict[str, Value] = {"messages": 0, "log_problems": "; ".join(log.problems)}
+    found: dict[str, Value] = {"messages": 0, "log_problems": "; ".join(_problems(log))}
     silent = metrics.fallen_silent(log).items()
     tables = _bench_tables(log)
     unheard = [f"{name} never heard" for name, table in SPOKEN_BY.items() if table in tables and not len(log[name])]

@@ -29,6 +29,7 @@ PROFILE = "ros2"
 SCHEMA_ENCODING = "ros2msg"
 MESSAGE_ENCODING = "cdr"
 METADATA_NAME = "softloop"
+CUT_OFF_NAME = "softloop.cut_off"  # metadata of a repaired log whose recorder did not end it: its end is not the run's
 LIBRARY = "softloop"
 CHUNK_BYTES = 64 * 1024  # closing a chunk of this size takes about a millisecond; one of 1 MiB takes fifteen
 # Attached from the run's directory when they stand there; versions.json and git.json are made here.

@@ -2,11 +2,6 @@
 
 JUSTIFIED = {
     "gate": {
-        "change_state: output.refused = reason if asked and event != EVENT_ARM else REASON_NONE -> "
-        "output.refused = reason if asked else REASON_NONE": (
-            "The event is ARM only where the branches before it were not taken, and the second of them is taken for every reason "
-            "but REASON_NONE: with ARM the reason is REASON_NONE anyway."
-        ),
         "change_state: if state.gate != before and state.gate != GATE_ARMED: -> if state.gate != before:": (
             "On arming, too, the venting would begin anew; but while armed nothing reads it, and every way out of ARMED sets "
             "both of its fields again."

@@ -160,7 +160,7 @@ class FakeState:
     """A gate that stays as it is, heard all the time."""
 
     def __init__(self, gate):
-        self.gate, self.valves_heard_ns = gate, 1 << 62
+        self.gate, self.valves_heard_ns, self.gate_stamp_ns = gate, 1 << 62, 123
 
     def refresh(self):
         return []

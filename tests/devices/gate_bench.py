@@ -22,6 +22,7 @@ class GateBench:
         self.state, self.given, self.output = (new_record(d) for d in (g.GATE_STATE, g.GATE_INPUT, g.GATE_OUTPUT))
         self.now_ns = START_NS
         self.seq, self.arms = 1000, 0
+        self.asked = {}
 
     def tick(self, *, command=True, heard=True, after_ns=PERIOD_NS, **fields):
         """One step; `fields` replace what the inputs would be. Returns the output record."""
@@ -46,7 +47,12 @@ class GateBench:
     def arm(self, **fields):
         """A tick with an arm request not made before."""
         self.arms += 1
-        return self.tick(arm=1, arm_origin=77, arm_seq=self.arms, **fields)
+        return self.request(77, self.arms, **fields)
+
+    def request(self, origin, seq, **fields):
+        """A tick with an arm request, which answers what the gate said a tick before unless told otherwise."""
+        self.asked = {"arm": 1, "arm_origin": origin, "arm_seq": seq, "arm_stamp_ns": self.now_ns}
+        return self.tick(**(self.asked | fields))
 
     def armed(self):
         """Ticks until currents pass; returns this bench."""

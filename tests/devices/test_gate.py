@@ -156,17 +156,17 @@ def test_a_held_arm_request_does_not_arm_again():
     bench = GateBench().armed()
     bench.tick(stop=1)
     for _ in range(20):
-        assert bench.tick(arm=1, arm_origin=77, arm_seq=bench.arms).gate == g.GATE_FAULT
+        assert bench.request(77, bench.arms).gate == g.GATE_FAULT
     assert bench.arm().gate == g.GATE_ARMED
 
 
 def test_two_who_hold_their_requests_do_not_arm_again_between_them():
     bench = GateBench().armed()
-    assert bench.tick(arm=1, arm_origin=5, arm_seq=1).gate == g.GATE_ARMED
+    assert bench.request(5, 1).gate == g.GATE_ARMED
     bench.tick(stop=1)
     for _ in range(10):
-        assert bench.tick(arm=1, arm_origin=77, arm_seq=bench.arms).gate == g.GATE_FAULT
-        assert bench.tick(arm=1, arm_origin=5, arm_seq=1).gate == g.GATE_FAULT
+        assert bench.request(77, bench.arms).gate == g.GATE_FAULT
+        assert bench.request(5, 1).gate == g.GATE_FAULT
 
 
 def test_stop_beats_disarm_beats_arm():
@@ -297,7 +297,7 @@ def test_no_sequence_of_events_passes_current_that_it_must_not(events):
         before = {name: bench.state[name].item() for name in ("gate", "charge_ma", "exhaust_ma")}
         fields = step | bad
         if arm == "held":
-            fields |= {"arm": 1, "arm_origin": 77, "arm_seq": bench.arms}
+            fields |= {"arm": 1, "arm_origin": 77, "arm_seq": bench.arms, "arm_stamp_ns": bench.now_ns}
         judge_step(bench, before, arm, bench.arm(**fields) if arm == "new" else bench.tick(**fields))
 
 

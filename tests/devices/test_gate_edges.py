@@ -1,6 +1,8 @@
 """The gate at its edges: limits met exactly, the first instants of a clock, numbers of commands and of who asks to arm."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from softloop.devices import gate as g
 from softloop.devices.config import PERIOD_NS
@@ -90,7 +92,7 @@ def test_a_pressure_heard_long_ago_does_not_keep_the_venting_up():
 
 
 def request(bench, origin, seq, **fields):
-    return bench.tick(arm=1, arm_origin=origin, arm_seq=seq, **fields)
+    return bench.request(origin, seq, **fields)
 
 
 @pytest.mark.parametrize("origin", [0, 77])
@@ -109,22 +111,53 @@ def test_an_older_request_does_not_make_a_used_one_new():
     assert request(bench, 5, 10).gate == g.GATE_ARMED
 
 
-def test_eight_who_asked_are_remembered_and_of_nine_the_first_is_forgotten():
+def test_eight_who_asked_are_remembered_and_a_ninth_is_taken_when_one_may_be_forgotten():
     bench = GateBench()
     bench.tick()
     for origin in range(8):
         bench.tick(stop=1)
         assert request(bench, origin, 1).gate == g.GATE_ARMED
     bench.tick(stop=1)
-    for origin in range(8):
+    first_ns = bench.now_ns - 15 * PERIOD_NS
+    for origin in range(1, 8):
         assert request(bench, origin, 1).gate == g.GATE_FAULT
-    assert request(bench, 8, 1).gate == g.GATE_ARMED
+    assert request(bench, 8, 1).gate == g.GATE_FAULT, "all eight were heard within the last second"
+    assert bench.state.requesters == 8
+    bench.tick(after_ns=first_ns + g.ARM_AGE_NS - bench.now_ns - PERIOD_NS)
+    assert request(bench, 8, 2).gate == g.GATE_FAULT, "the one heard first was heard a second ago"
+    assert request(bench, 8, 3).gate == g.GATE_ARMED
     bench.tick(stop=1)
-    for origin in range(1, 9):
-        assert request(bench, origin, 1).gate == g.GATE_FAULT
-    assert request(bench, 0, 1).gate == g.GATE_ARMED
+    for origin in range(1, 8):
+        assert request(bench, origin, 1).gate == g.GATE_FAULT, "each but the one heard first is still remembered"
+
+
+@given(st.lists(st.tuples(st.integers(0, 2**63 - 1), st.sampled_from([PERIOD_NS, 100 * MS, 400 * MS])), max_size=30))
+def test_a_request_played_again_never_arms_however_many_others_asked_between(others):
+    bench = GateBench().armed()
+    first = dict(bench.asked)
     bench.tick(stop=1)
-    assert request(bench, 2, 1).gate == g.GATE_FAULT, "the one heard second is still remembered"
+    for origin, after_ns in others:
+        request(bench, origin, 2**62, driver=g.DRIVER_WATCHDOG, after_ns=after_ns)  # refused, but heard
+        assert bench.tick(**first).gate == g.GATE_FAULT
+
+
+@pytest.mark.parametrize(
+    ("age_ns", "arms"), [(0, True), (g.ARM_AGE_NS, True), (g.ARM_AGE_NS + 1, False), (-1, False), (2**62, False)]
+)
+def test_an_arm_request_that_answers_an_old_word_or_none_of_this_clock_does_not_arm(age_ns, arms):
+    bench = GateBench()
+    bench.tick()
+    output = request(bench, 5, 1, arm_stamp_ns=bench.now_ns + PERIOD_NS - age_ns)
+    assert bool(output.gate == g.GATE_ARMED) is arms
+    assert output.refused == (g.REASON_NONE if arms else g.REASON_OLD_REQUEST)
+    assert request(bench, 5, 2).gate == g.GATE_ARMED
+
+
+def test_a_stop_is_no_less_for_a_late_arm_request():
+    bench = GateBench().armed()
+    assert request(bench, 5, 1, arm_stamp_ns=1).gate == g.GATE_ARMED, "nor does one disarm"
+    output = request(bench, 5, 2, arm_stamp_ns=1, stop=g.STOP_ASKED)
+    assert (output.gate, output.reason, output.refused) == (g.GATE_FAULT, g.REASON_EMERGENCY_STOP, g.REASON_EMERGENCY_STOP)
 
 
 def test_a_stop_gives_a_fault_its_reason_anew_and_that_is_a_change():

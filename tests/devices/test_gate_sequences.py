@@ -54,7 +54,7 @@ def test_without_a_new_arm_request_no_sequence_leads_from_fault_to_charge_curren
     bench = GateBench().armed()  # by request 1 of requester 77
     assert bench.tick(**fault[1]).gate == g.GATE_FAULT
     for step, request in events:
-        output = bench.tick(**(step | request))
+        output = bench.tick(**(step | request | {"arm_stamp_ns": bench.now_ns}))
         assert output.gate == g.GATE_FAULT
         assert is_vented_or_shut(output)
 
@@ -98,7 +98,14 @@ class GateMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.bench.arms > 0)
     @rule()
     def old_arm_request(self):
-        self.step(arm=1, arm_origin=77, arm_seq=self.bench.arms)
+        self.step(**self.bench.asked)
+
+    @rule(origin=st.integers(0, 2**63 - 1), seq=st.integers(0, 2**63 - 1), late_ns=st.sampled_from([1, MS, 3600_000 * MS]))
+    def held_back_arm_request(self, origin, seq, late_ns):
+        """Of anybody, also of more than the gate remembers."""
+        if origin != 77:  # whose numbers the model counts
+            asked_ns = self.bench.now_ns + PERIOD_NS - g.ARM_AGE_NS - late_ns
+            self.step(arm=1, arm_origin=origin, arm_seq=seq, arm_stamp_ns=asked_ns)
 
     @rule()
     def disarm(self):

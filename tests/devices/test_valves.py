@@ -62,11 +62,11 @@ class Rig:
             self.verdicts.append(self.judge.judge(frame.data))
             self.frames.append(cf.decode_valve_command(frame.data))
 
-    def request(self, action, put=None):
+    def request(self, action, put=None, age_ns=0):
         self.requests += 1
         request = message("GateRequest")
         put = put or (self.put_arm if action == ARM else self.put_request)
-        put(request.pack(request.make(seq=self.requests, stamp_ns=CLOCK.now_ns(), origin=2**63 + 5, action=action)))
+        put(request.pack(request.make(seq=self.requests, stamp_ns=CLOCK.now_ns() - age_ns, origin=2**63 + 5, action=action)))
 
     def until(self, condition, **fields):
         return until(lambda: self.turn(**fields) or condition())
@@ -201,6 +201,30 @@ def test_a_bus_that_is_not_there_is_one_line(meet, tmp_path):
     config = replace(CONFIG, bus=CanConfig(interface="socketcan", channel="nosuchcan"))
     with bench(meet) as (a, _), pytest.raises(Unavailable, match=r"^CAN bus socketcan:nosuchcan: [^\n]+$"):
         run_to_its_end(valves.run, config, a, tmp_path)
+
+
+def test_a_request_that_was_held_back_does_not_arm(rig):
+    rig.until(lambda: rig.newest("driver") == g.DRIVER_OK and rig.newest("command_seq"))
+    rig.request(ARM, age_ns=2 * g.ARM_AGE_NS)
+    rig.until(lambda: rig.events.find(kind=KIND_GATE, reason=g.REASON_OLD_REQUEST))
+    assert rig.newest("gate") == g.GATE_DISARMED
+    rig.arm()
+
+
+def test_of_two_requests_at_once_both_are_used_up(rig):
+    rig.until(lambda: rig.newest("driver") == g.DRIVER_OK and rig.newest("command_seq"))
+    kind = message("GateRequest")
+    asked = [kind.make(seq=1, stamp_ns=CLOCK.now_ns(), origin=origin, action=ARM) for origin in (1, 2)]
+    for one in asked:
+        rig.put_arm(kind.pack(one))
+    rig.until(lambda: rig.newest("gate") == g.GATE_ARMED)
+    rig.request(STOP)
+    rig.until(lambda: rig.newest("gate") == g.GATE_FAULT)
+    for one in asked:  # played again, as if asked now
+        rig.put_arm(kind.pack(one._replace(stamp_ns=CLOCK.now_ns())))
+    for _ in range(20):
+        rig.turn()
+    assert rig.newest("gate") == g.GATE_FAULT
 
 
 def test_a_request_under_a_key_that_is_not_its_own_is_thrown_away(rig):

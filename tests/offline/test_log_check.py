@@ -13,7 +13,9 @@ from softloop.offline.log import open_log
 from softloop.offline.log_check import check_log
 from softloop.offline.log_repair import repair_log
 from softloop.offline.mcap_walk import FileRecords, next_chunk
+from softloop.offline.summary import summarise
 from softloop.wire.errors import BadFile, Unavailable
+from softloop.wire.mcap_layout import CUT_OFF_NAME
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +69,8 @@ def test_an_unfinished_log_is_repaired_in_place_and_the_old_one_kept(tmp_path, m
     assert result.messages == len(made)
     assert (tmp_path / "run.mcap.damaged").read_bytes() == old
     assert after.attachments == before.attachments
-    assert after.metadata == before.metadata
+    assert after.metadata == before.metadata | {CUT_OFF_NAME: {}}
+    assert not after.finished
     for name, records in before.channels.items():
         assert np.array_equal(after[name].view(np.uint8), records.view(np.uint8))
     with file.open("rb") as stream:
@@ -142,7 +145,7 @@ def test_the_commands_and_their_exit_codes(tmp_path, made, capsys):
     said = capsys.readouterr().out
     assert "truth: 1 missing, 5 to 5" in said
     assert "loss window" in said
-    assert "did not end this file" in said
+    assert "did not end its file" in said
     assert command("check", run, "--json") == 1
     assert json.loads(capsys.readouterr().out)["missing"] == 1
     assert command("repair", run, "-o", tmp_path / "good.mcap") == 0
@@ -182,3 +185,16 @@ def test_what_stands_in_an_attachment_of_a_wrong_length_is_read_and_kept(tmp_pat
     assert damaged.channels
     again = open_log(repair_log(file, tmp_path / "good.mcap").file)
     assert {name: len(r) for name, r in again.channels.items()} == {name: len(r) for name, r in damaged.channels.items()}
+
+
+def test_a_repair_does_not_make_a_log_that_was_cut_off_whole(tmp_path, made):
+    """Its gaps show by their numbers; that its end is missing shows by nothing but what the repair says of it."""
+    cut = synthetic.write_log(tmp_path / "cut.mcap", made, finish=False)
+    again = repair_log(repair_log(cut, tmp_path / "good.mcap").file, tmp_path / "better.mcap").file
+    assert open_log(again).problems == []
+    assert not check_log(open_log(again)).whole
+    found = summarise(open_log(again))
+    assert not found["evidence_valid"]
+    assert "the log file is damaged or unfinished" in found["evidence_problems"]
+    whole = repair_log(synthetic.write_log(tmp_path / "whole.mcap", made), tmp_path / "copy.mcap").file
+    assert check_log(open_log(whole)).whole

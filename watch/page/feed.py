@@ -53,6 +53,10 @@ class Feed:
         heard = [lane.heard_s for lane in self.overview.lanes.values() if lane.channel is VALVES]
         return (None if self.overview.valves is None else self.overview.valves.gate), max(heard, default=0.0)
 
+    def gate_stamp_ns(self) -> int:
+        """Of the gate's newest word, rig clock; 0 for none yet."""
+        return 0 if self.overview.valves is None else int(self.overview.valves.stamp_ns)
+
     async def pump(self) -> None:
         """Turn frames until cancelled; a frame that came late is not caught up."""
         next_s = time.monotonic()

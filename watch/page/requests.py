@@ -33,8 +33,10 @@ class Requester:
         wire: by which it asks.
     """
 
-    def __init__(self, wire: Wire) -> None:
+    def __init__(self, wire: Wire, gate_stamp_ns: Callable[[], int] = lambda: 0) -> None:
+        """`gate_stamp_ns()`: the stamp of the gate's newest word, which an arm request answers; 0 for none."""
         self.wire = wire
+        self._gate_stamp_ns = gate_stamp_ns
         channels = (c for c in (REQUEST, ARM) if wire.may_put(c))
         self._publishers = {c.name: wire.declare_publisher(key(wire.bench, c), realtime=True) for c in channels}
         self._origin = secrets.randbits(63)
@@ -50,7 +52,8 @@ class Requester:
         with self._lock:
             self._seqs[channel.name] += 1
             code = constant("GateRequest", f"ACTION_{action.upper()}")
-            made = kind.make(seq=self._seqs[channel.name], stamp_ns=time.monotonic_ns(), origin=self._origin, action=code)
+            stamp_ns = self._gate_stamp_ns() if action == "arm" else time.monotonic_ns()
+            made = kind.make(seq=self._seqs[channel.name], stamp_ns=stamp_ns, origin=self._origin, action=code)
             self._publishers[channel.name].put(kind.pack(made))
 
 

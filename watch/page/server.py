@@ -127,7 +127,7 @@ def _join(site: Site, zenoh: ZenohConfig, bench: str, stop: Stop) -> None:
     def use(wire: Wire, stop_wire: Wire) -> None:
         wire.settle(lambda: bool(stop))
         site.stop_line.connect(stop_wire)
-        site.requester = Requester(wire)
+        site.requester = Requester(wire, site.feed.gate_stamp_ns)
         site.feed.connect(wire)
         while not stop.wait(POLL_S):
             pass
