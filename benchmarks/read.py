@@ -1,4 +1,4 @@
-"""Reading a whole log: `open_log` beside `mcap`'s own `make_reader`, one after the other on the same file in the same run.
+"""Reading a whole log: `open_log` beside `mcap`'s own `make_reader`, in turn on the same file in the same run.
 
     python benchmarks/read.py RUN [--times 5] [--json]
 
@@ -12,7 +12,7 @@ import argparse
 import json
 import time
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +29,14 @@ def read_raw(path: Path) -> int:
         return sum(1 for _ in make_reader(file).iter_messages(log_time_order=False))
 
 
-def seconds(call: Callable[[], Any], times: int) -> list[float]:
-    """CPU time of each of some calls: what else the machine does then counts little."""
-    out = []
+def seconds(calls: Sequence[Callable[[], Any]], times: int) -> list[list[float]]:
+    """CPU time of some calls, in turn, so that what the machine does beside meets them alike."""
+    out: list[list[float]] = [[] for _ in calls]
     for _ in range(times):
-        begin = time.process_time()
-        call()
-        out.append(time.process_time() - begin)
+        for call, taken in zip(calls, out, strict=True):
+            begin = time.process_time()
+            call()
+            taken.append(time.process_time() - begin)
     return out
 
 
@@ -54,7 +55,7 @@ def arrays_of(log: Log) -> list[np.ndarray]:
 
 def measure(path: Path, times: int) -> dict[str, Any]:
     log = open_log(path)
-    ours, theirs = seconds(lambda: open_log(path), times), seconds(lambda: read_raw(path), times)
+    ours, theirs = seconds([lambda: open_log(path), lambda: read_raw(path)], times)
     return {
         "messages": sum(len(a) for a in arrays_of(log)),
         "file_mb": path.stat().st_size / 1e6,

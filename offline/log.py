@@ -17,7 +17,6 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import lz4.frame
 import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -27,7 +26,8 @@ from mcap.records import Channel, Chunk, Metadata, Schema, Statistics
 from numba import types
 from numpy.typing import NDArray
 
-from softloop.offline.mcap_walk import RECORD, FileRecords, read_attachment
+from softloop.offline.log_sound import READ_ONLY, NotSoundError, read_sound
+from softloop.offline.mcap_walk import RECORD, FileRecords, decompress, read_attachment
 from softloop.wire.channels import CAN, CHANNELS
 from softloop.wire.errors import BadFile
 from softloop.wire.kernel import array_of, kernel
@@ -40,14 +40,11 @@ Bytes = NDArray[np.uint8]
 CanKey = tuple[str, int]
 
 _MESSAGE_HEAD = 22  # channel id u16, sequence u32, log time u64, publish time u64
-_LZ4_RATIO_MAX = 260  # LZ4 cannot expand more than 255 times; zstd's window is bounded by _CHUNK_MAX alone
-_CHUNK_MAX, _SORT_BYTES = 1 << 30, 4 << 20
+_SORT_BYTES = 4 << 20
 # What a damaged record can raise while it is parsed.
 DAMAGE = (McapError, struct.error, ValueError, KeyError, RuntimeError, OverflowError, MemoryError, EOFError, zstandard.ZstdError)
 _SILENT = {Opcode.HEADER, Opcode.MESSAGE_INDEX, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX}
 _SILENT |= {Opcode.SUMMARY_OFFSET, Opcode.DATA_END, Opcode.FOOTER}
-
-_READ_ONLY = types.Array(types.u1, 1, "C", readonly=True)
 
 
 @dataclass
@@ -101,7 +98,7 @@ class Log:
         return self.origin.bench if self.origin else ""
 
 
-@kernel(types.i8(_READ_ONLY, array_of(types.i8, 2)))
+@kernel(types.i8(READ_ONLY, array_of(types.i8, 2)))
 def find_messages(data: Bytes, found: NDArray[np.int64]) -> int:
     """Walk the records of an uncompressed chunk; a row (opcode, channel id or 0, offset of the content, its length) for each.
 
@@ -139,12 +136,19 @@ def open_log(path: Path | str) -> Log:
             if file.read(len(MAGIC)) != MAGIC:
                 raise BadFile(f"{path}: not an MCAP file")
         content: Any = np.memmap(path, np.uint8, "r")
-        return _Reader(path).read(memoryview(content))
+        return _read(path, content)
     except OSError as error:
         raise BadFile(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-class _Reader:
+def _read(path: Path, content: Any) -> Log:
+    try:
+        return read_sound(LogReader(path), np.frombuffer(content, np.uint8))
+    except (NotSoundError, *DAMAGE):
+        return LogReader(path).read(memoryview(content))
+
+
+class LogReader:
     """The state of one reading."""
 
     def __init__(self, path: Path) -> None:
@@ -183,6 +187,19 @@ class _Reader:
         self._resolve()
         self._check_counts()
         return self.log
+
+    def handle(self, opcode: int, content: bytes, *, sure: bool = False) -> None:
+        """Take one record, `sure` as in `_schema`. Raises one of DAMAGE, and NotSoundError on one of no known kind."""
+        if sure and opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            (self._schema if opcode == Opcode.SCHEMA else self._channel)(content, sure=True)
+        elif sure or opcode not in self._handlers or opcode == Opcode.MESSAGE:
+            raise NotSoundError
+        else:
+            self._handlers[opcode](content)
+
+    def described(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
+        """What the file has said of its channels so far."""
+        return dict(self.schemas), dict(self.topics)
 
     def _problem(self, text: str) -> None:
         self.log.problems.append(text)
@@ -288,18 +305,23 @@ class _Reader:
             blocks = self.rows[channel_id]
             n_rows = sum(len(b) for b in blocks)
             try:
-                self._file_under(self._topic(channel_id), self._kind(channel_id), blocks)
+                topic, kind = self.topic(channel_id), self.kind(channel_id)
+                records, rejected = _as_records(kind, blocks)
+                if rejected:
+                    self._problem(f"{topic}: {rejected} payloads are no {kind.name}, left out")
+                self.file_under(topic, records)
             except DAMAGE as error:
                 self._problem(f"{n_rows} messages of channel id {channel_id} left out: {_first_line(error)}")
             blocks.clear()
 
-    def _topic(self, channel_id: int) -> str:
+    def topic(self, channel_id: int) -> str:
+        """Of a channel. Raises ValueError when the file does not describe it."""
         if channel_id not in self.topics:
             raise ValueError("the file does not describe this channel")
         return self.topics[channel_id].topic
 
-    def _kind(self, channel_id: int) -> MessageType:
-        """The message as the file itself defines it, so that logs outlive changes of our definitions."""
+    def kind(self, channel_id: int) -> MessageType:
+        """The message as the file itself defines it, so that logs outlive changes of our definitions. Raises ValueError."""
         schema = self.schemas.get(self.topics[channel_id].schema_id)
         if schema is None or schema.encoding != SCHEMA_ENCODING or not schema.name.startswith(f"{PACKAGE}/msg/"):
             raise ValueError(f"{self.topics[channel_id].topic} has no schema of softloop's")
@@ -307,13 +329,11 @@ class _Reader:
         known = {c.message for c in CHANNELS}
         return message(name) if name in known and message(name).text == text else _parse(name, text)
 
-    def _file_under(self, topic: str, kind: MessageType, blocks: list[Bytes]) -> None:
+    def file_under(self, topic: str, records: Records) -> None:
+        """Keep a channel's messages under its name. Raises ValueError when the name is none of ours, or is there already."""
         where = split_topic(topic)
         if where is None:
             raise ValueError(f"'{topic}' is no topic of softloop's")
-        records, rejected = _as_records(kind, blocks)
-        if rejected:
-            self._problem(f"{topic}: {rejected} payloads are no {kind.name}, left out")
         _, name, frame = where
         if (name in self.log.channels) if frame is None else (frame in self.log.can):
             raise ValueError(f"'{topic}' is in the file twice")
@@ -341,22 +361,6 @@ def _stream(content: bytes) -> ReadDataStream:
 
 def _first_line(error: BaseException) -> str:
     return (str(error) or type(error).__name__).splitlines()[0][:120]
-
-
-def decompress(chunk: Chunk) -> bytes:
-    """The records of a chunk. Raises what its library raises on damage, and ValueError on sizes that cannot be."""
-    size = chunk.uncompressed_size
-    if size > _CHUNK_MAX:
-        raise ValueError(f"{size} bytes declared")
-    if chunk.compression == "lz4":
-        if size > _LZ4_RATIO_MAX * (len(chunk.data) + 64):
-            raise ValueError(f"{size} bytes declared in {len(chunk.data)}")
-        return lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size) if size else b""
-    if chunk.compression == "zstd":
-        return zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
-    if chunk.compression:
-        raise ValueError(f"unknown compression '{chunk.compression[:16]}'")
-    return chunk.data
 
 
 def _origin(content: dict[str, str]) -> Origin:

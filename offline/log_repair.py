@@ -17,8 +17,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Header, Metadata, Schema
 
-from softloop.offline.log import DAMAGE, decompress, find_messages
-from softloop.offline.mcap_walk import RECORD, FileRecords, holds_chunk_mark, read_attachment
+from softloop.offline.log import DAMAGE, find_messages
+from softloop.offline.mcap_walk import RECORD, FileRecords, decompress, holds_chunk_mark, read_attachment
 from softloop.wire.errors import BadFile, Unavailable
 from softloop.wire.log_parts import parts_of
 from softloop.wire.mcap_chunks import MAGIC, ChunkedWriter

@@ -7,15 +7,19 @@ import zlib
 from collections.abc import Iterator
 from io import BytesIO
 
+import lz4.frame
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment
+from mcap.records import Attachment, Chunk
 
 from softloop.wire.mcap_chunks import MAGIC
 
 RECORD = struct.Struct("<BQ")  # opcode and length before every record
 _CHUNK_HEAD = struct.Struct("<BQQQQII")  # opcode, length, start, end, uncompressed size, crc, length of the compression's name
 _COMPRESSIONS = (b"lz4", b"zstd")
+_LZ4_RATIO_MAX = 260  # LZ4 cannot expand more than 255 times; zstd's window is bounded by _CHUNK_MAX alone
+_CHUNK_MAX = 1 << 30
 
 
 class FileRecords:
@@ -119,3 +123,19 @@ def _is_chunk(view: memoryview, at: int, name_length: int) -> bool:
     (records,) = struct.unpack_from("<Q", view, body)
     # What the chunk's length leaves for its records must be what the records' own length says.
     return bool(length == _CHUNK_HEAD.size - RECORD.size + name_length + 8 + records and at + RECORD.size + length <= len(view))
+
+
+def decompress(chunk: Chunk) -> bytes:
+    """The records of a chunk. Raises what its library raises on damage, and ValueError on sizes that cannot be."""
+    size = chunk.uncompressed_size
+    if size > _CHUNK_MAX:
+        raise ValueError(f"{size} bytes declared")
+    if chunk.compression == "lz4":
+        if size > _LZ4_RATIO_MAX * (len(chunk.data) + 64):
+            raise ValueError(f"{size} bytes declared in {len(chunk.data)}")
+        return lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size) if size else b""
+    if chunk.compression == "zstd":
+        return zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
+    if chunk.compression:
+        raise ValueError(f"unknown compression '{chunk.compression[:16]}'")
+    return chunk.data
