@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 import tracemalloc
 from collections.abc import Callable, Sequence
@@ -21,6 +22,7 @@ from mcap.reader import make_reader
 
 from softloop.offline.log import Log, open_log
 from softloop.offline.run_log import find_log
+from softloop.wire.errors import SoftloopError
 
 
 def read_raw(path: Path) -> int:
@@ -74,7 +76,10 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=5)
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
-    found = measure(find_log(asked.run), asked.times)
+    try:
+        found = measure(find_log(asked.run), asked.times)
+    except SoftloopError as error:
+        sys.exit(f"read: {error}")
     if asked.json:
         print(json.dumps(found, indent=2))
         return
