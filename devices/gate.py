@@ -60,13 +60,16 @@ REASON_OLD_REQUEST = _word("REASON_OLD_REQUEST")
 DRIVER_OK, DRIVER_WATCHDOG, DRIVER_SILENT = _word("DRIVER_OK"), _word("DRIVER_WATCHDOG"), _word("DRIVER_SILENT")
 
 EVENT_STOP, EVENT_CONDITION, EVENT_DISARM, EVENT_ARM, EVENT_NOTHING = range(5)
-NEXT = np.array(
-    [
-        [GATE_FAULT, GATE_DISARMED, GATE_DISARMED, GATE_ARMED, GATE_DISARMED],
-        [GATE_FAULT, GATE_FAULT, GATE_DISARMED, GATE_ARMED, GATE_ARMED],
-        [GATE_FAULT, GATE_FAULT, GATE_FAULT, GATE_ARMED, GATE_FAULT],
-    ]
-)
+
+
+def _next_states() -> np.ndarray:
+    disarmed = [GATE_FAULT, GATE_DISARMED, GATE_DISARMED, GATE_ARMED, GATE_DISARMED]
+    armed = [GATE_FAULT, GATE_FAULT, GATE_DISARMED, GATE_ARMED, GATE_ARMED]
+    fault = [GATE_FAULT, GATE_FAULT, GATE_FAULT, GATE_ARMED, GATE_FAULT]
+    return np.array([disarmed, armed, fault])
+
+
+NEXT = _next_states()
 """New state by state (row) and event (column): the table above."""
 
 STOP_ASKED, STOP_INVARIANT = 1, 2  # bits of `stop`: an emergency stop, and a fault asked for by the monitor

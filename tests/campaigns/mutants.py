@@ -21,6 +21,7 @@ ARITHMETIC = {
     ast.FloorDiv: ast.Mult,
 }
 SWAPPED = {"min": "max", "max": "min"}
+STATES = ("GATE_DISARMED", "GATE_ARMED", "GATE_FAULT")
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,8 @@ def _changes(node):
         yield copy.deepcopy(node.operand)
     elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
         yield ast.Constant(node.value + 1)
+    elif isinstance(node, ast.Name) and node.id in STATES:
+        yield from (ast.Name(other, ast.Load()) for other in STATES if other != node.id)
     elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in SWAPPED:
         yield from _calls(node)
     elif isinstance(node, (ast.If, ast.IfExp)):

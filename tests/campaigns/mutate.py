@@ -48,7 +48,7 @@ TARGETS = {
         "softloop.devices.gate",
         (
             "command_reason", "take_command", "driver_now", "condition", "arm_is_new", "change_state", "vent_output", "limited",
-            "gate_step",
+            "gate_step", "_next_states", "gate_config",
         ),
         (*(f"tests/devices/test_gate{part}.py" for part in ("_edges", "", "_sequences")), "-k", _QUICK),
     ),
