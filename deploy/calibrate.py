@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,11 @@ class Known:
         return not (self.chamber_kpa is None and self.supply_kpa is None and self.bent_deg is None)
 
     def check(self) -> None:
-        """Raises BadConfig when rest and a known point are asked for at once."""
+        """Raises BadConfig when rest and a known point are asked for at once, or one of them is no finite number."""
+        for name in ("rest_deg", "chamber_kpa", "supply_kpa", "bent_deg"):
+            said = getattr(self, name)
+            if said is not None and not isfinite(said):
+                raise BadConfig(f"--{name.replace('_', '-')}: {said} is not a finite number; give one")
         if self.point and (self.supply_vented or self.rest_deg is not None):
             raise BadConfig(
                 "--supply-vented and --rest-deg are of the rig at rest, --chamber-kpa, --supply-kpa and --bent-deg of a "

@@ -110,7 +110,7 @@ def inclinometer_zero(config: InclinometerConfig, angle_counts: Sequence[int], k
     if angle_deg is None:
         return found
     zero_deg = config.direction * angle_deg - known_deg
-    if abs(zero_deg) > 360.0:
+    if not abs(zero_deg) <= 360.0:  # nan, too, is none
         return found.refuse(f"inclinometer: zero_deg would be {zero_deg:.1f}; re-power the device, it has been turned round")
     found.keys["inclinometer", "zero_deg"] = round(zero_deg, 4)
     found.lines.append(f"inclinometer: zero_deg {zero_deg:.3f}, by {zero_deg - config.zero_deg:+.3f} deg other than before")
@@ -120,7 +120,7 @@ def inclinometer_zero(config: InclinometerConfig, angle_counts: Sequence[int], k
 def inclinometer_sign(config: InclinometerConfig, angle_counts: Sequence[int], known_deg: float) -> Found:
     """`direction`, and `zero_deg` with it, from the device's angle at a known bending angle."""
     found = Found()
-    if abs(known_deg) < LEAST_BEND_DEG:
+    if not abs(known_deg) >= LEAST_BEND_DEG:  # nan, too, tells none
         return found.refuse(f"inclinometer: {known_deg:g} deg does not tell the sign; bend it by {LEAST_BEND_DEG:g} deg or more")
     angle_deg = _still_deg(found, config, angle_counts)
     if angle_deg is None:

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import sys
+from math import inf
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from softloop.deploy.cli_app import EXIT_CODES, BenchArgument, OptionalBench, RunArgument, RunDir, app, log_app
+from softloop.deploy.cli_app import EXIT_CODES, BenchArgument, OptionalBench, RunArgument, RunDir, app, log_app, number
 from softloop.deploy.interrupts import careful_interrupts
 from softloop.wire.errors import EXIT_LOST, EXIT_OK, EXIT_USAGE, BadConfig, SoftloopError
 
@@ -19,7 +20,7 @@ def run(
     bench: BenchArgument,
     run_dir: Annotated[Path | None, typer.Option(metavar="DIR", help="Default: runs/<bench>-<UTC time>.")] = None,
     host: Annotated[str | None, typer.Option(metavar="NAME", help="Of a bench on several hosts: which of them this is.")] = None,
-    duration: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="End after S seconds, armed.")] = None,
+    duration: Annotated[float | None, number(metavar="S", min=0.0, help="End after S seconds, armed.")] = None,
     no_report: Annotated[bool, typer.Option("--no-report", help="Leave out the report at the end.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show nothing but errors.")] = False,
     page: Annotated[bool, typer.Option("--page", help="Serve the live page while the rig runs.")] = False,
@@ -93,9 +94,9 @@ def request(
     kind: Annotated[
         str, typer.Argument(metavar="[KIND]", help="What breaks or is mended, as in [[plant.faults]]; mend: default all.")
     ] = "",
-    size: Annotated[float, typer.Option(metavar="X", help="Of a fault that has one.")] = 0.0,
-    seconds: Annotated[float, typer.Option("--for", metavar="S", help="How long it stays. Default: until mended.")] = 0.0,
-    timeout: Annotated[float, typer.Option(metavar="S", min=0.1, help="How long to wait for the answer.")] = 5.0,
+    size: Annotated[float, number(metavar="X", help="Of a fault that has one.")] = 0.0,
+    seconds: Annotated[float, number("--for", metavar="S", help="How long it stays. Default: until mended.")] = 0.0,
+    timeout: Annotated[float, number(metavar="S", min=0.1, help="How long to wait for the answer.")] = 5.0,
 ) -> int:
     """Ask the gate of a running bench to arm, disarm or stop, or its simulated rig to break, and report the answer."""
     from softloop.deploy.bench import find_bench, load_bench
@@ -184,15 +185,13 @@ def plot(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A file ending in .svg, .pdf or .png. Default: plot.svg beside the log.")
     ] = None,
-    first: Annotated[float, typer.Option("--from", metavar="S", help="From S seconds after the start of the log.")] = float(
-        "-inf"
-    ),
-    last: Annotated[float, typer.Option("--to", metavar="S", help="Until then.")] = float("inf"),
+    first: Annotated[float | None, number("--from", metavar="S", help="From S seconds after the start of the log.")] = None,
+    last: Annotated[float | None, number("--to", metavar="S", help="Until then.")] = None,
 ) -> int:
     """Draw fields of a log against time, one panel per unit."""
     from softloop.deploy.plotting import plot_run
 
-    return plot_run(run, curves, out, first, last)
+    return plot_run(run, curves, out, -inf if first is None else first, inf if last is None else last)
 
 
 @app.command()
@@ -209,7 +208,7 @@ def compare(
 @app.command()
 def top(
     bench: OptionalBench = Path("sim"),
-    seconds: Annotated[float | None, typer.Option(metavar="S", min=0.1, help="End after S seconds.")] = None,
+    seconds: Annotated[float | None, number(metavar="S", min=0.1, help="End after S seconds.")] = None,
     once: Annotated[bool, typer.Option("--once", help="One look of two seconds (or --seconds), as plain text.")] = False,
 ) -> int:
     """Show a running bench: rates, ages, tick lateness, loads of buses and processes."""
@@ -258,8 +257,8 @@ def echo(
     ],
     bench: OptionalBench = Path("sim"),
     count: Annotated[int | None, typer.Option("--count", "-n", metavar="N", min=1, help="End after N messages.")] = None,
-    rate: Annotated[float | None, typer.Option(metavar="HZ", min=0.01, help="At most so many a second, each the newest.")] = None,
-    timeout: Annotated[float, typer.Option(metavar="S", min=0.0, help="Exit code 4 after S seconds without one; 0: wait.")] = 0.0,
+    rate: Annotated[float | None, number(metavar="HZ", min=0.01, help="At most so many a second, each the newest.")] = None,
+    timeout: Annotated[float, number(metavar="S", min=0.0, help="Exit code 4 after S seconds without one; 0: wait.")] = 0.0,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line.")] = False,
 ) -> int:
     """Print the messages of a channel of a running bench."""

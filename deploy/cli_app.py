@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from softloop.wire.errors import Interrupted
+from softloop.wire.errors import BadConfig, Interrupted
 
 EXIT_CODES = """Exit codes: 0 all is well; 1 the command ran and its answer is no (a gate fault, a difference, a refused request);
 2 a bad argument or a bad file; 3 the machine (an address in use, a device or permission that is missing);
@@ -43,3 +45,24 @@ RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run director
 BenchArgument = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="A bench file, or the name of a shipped one (sim).")]
 OptionalBench = Annotated[Path, typer.Argument(metavar="BENCH.toml", help="A bench file, or the name of a shipped one.")]
 RunDir = Annotated[Path, typer.Option(metavar="DIR", help="The run's directory.")]
+
+
+def finite(value: float | None) -> float | None:
+    """What every float option passes: nan is within any bounds, and inf within those open to one side. Raises BadParameter."""
+    if value is not None and not isfinite(value):
+        raise typer.BadParameter(f"{value} is not a finite number; give one.")
+    return value
+
+
+def number(*names: str, **settings: Any) -> Any:
+    """A float option, as `typer.Option`, that takes finite numbers alone."""
+    return typer.Option(*names, callback=finite, **settings)
+
+
+def numbers(option: str, text: str, example: str) -> tuple[float, ...]:
+    """The finite numbers of a text option, with commas between. Raises BadConfig."""
+    with suppress(ValueError):
+        found = tuple(float(part) for part in text.split(","))
+        if all(map(isfinite, found)):
+            return found
+    raise BadConfig(f"{option} {text}: give finite numbers with commas between, such as {example}")

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from softloop.deploy.cli_app import EXIT_CODES, BenchArgument, app
+from softloop.deploy.cli_app import EXIT_CODES, BenchArgument, app, number
 
 
 @app.command(epilog=EXIT_CODES)
@@ -74,7 +74,7 @@ def shadow(
 def tune(
     law: Annotated[str, typer.Argument(metavar="LAW", help="pid, pid_eso, smc, arc or arc_eso.")],
     seeds: Annotated[str, typer.Option(metavar="A:B", help="Tuning rigs; judge on others.")] = "1000:1008",
-    added_ms: Annotated[float, typer.Option(metavar="MS", min=0.0, max=150.0, help="Latency added to the rig's own.")] = 0.0,
+    added_ms: Annotated[float, number(metavar="MS", min=0.0, max=150.0, help="Latency added to the rig's own.")] = 0.0,
     evaluations: Annotated[int, typer.Option(metavar="N", min=1, help="At least so many.")] = 500,
     search_seed: Annotated[int, typer.Option(metavar="N", min=1, help="Of the optimiser.")] = 1,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the [controller] table here.")] = None,
@@ -151,10 +151,8 @@ def valve(
         list[str] | None,
         typer.Option("--map", metavar="KEY=COLUMN", help="current (mA), upstream, downstream (kPa gauge), flow (kg/s)."),
     ] = None,
-    discharge: Annotated[
-        float, typer.Option(metavar="C_f", min=0.01, max=1.0, help="Discharge coefficient; 1: areas hold it.")
-    ] = 1.0,
-    temperature: Annotated[float, typer.Option(metavar="K", min=200.0, max=400.0, help="Of the gas.")] = 293.15,
+    discharge: Annotated[float, number(metavar="C_f", min=0.01, max=1.0, help="Discharge coefficient; 1: areas hold it.")] = 1.0,
+    temperature: Annotated[float, number(metavar="K", min=200.0, max=400.0, help="Of the gas.")] = 293.15,
     as_json: Annotated[bool, typer.Option("--json", help="The answer as JSON.")] = False,
 ) -> int:
     """Identify a valve's model, Eqs. 12 and 16, from flow tests; what they do not show gets no number."""

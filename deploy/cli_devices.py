@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from softloop.deploy.cli_app import BenchArgument, app
+from softloop.deploy.cli_app import BenchArgument, app, number
 
 wt931_app = typer.Typer(help="The inclinometer.", rich_markup_mode=None)
 app.add_typer(wt931_app, name="wt931")
@@ -54,13 +54,11 @@ def calibrate(
     supply_vented: Annotated[
         bool, typer.Option("--supply-vented", help="At rest: nothing is on the supply sensor either.")
     ] = False,
-    rest_deg: Annotated[float | None, typer.Option(metavar="DEG", help="At rest: the bending angle is this.")] = None,
-    chamber_kpa: Annotated[
-        float | None, typer.Option(metavar="KPA", help="A known point: on the chamber, by a manometer.")
-    ] = None,
-    supply_kpa: Annotated[float | None, typer.Option(metavar="KPA", help="A known point: on the supply.")] = None,
-    bent_deg: Annotated[float | None, typer.Option(metavar="DEG", help="A known point: bent by hand to this angle.")] = None,
-    seconds: Annotated[float, typer.Option(metavar="S", min=0.5, max=600.0, help="For each thing that is listened to.")] = 5.0,
+    rest_deg: Annotated[float | None, number(metavar="DEG", help="At rest: the bending angle is this.")] = None,
+    chamber_kpa: Annotated[float | None, number(metavar="KPA", help="A known point: on the chamber, by a manometer.")] = None,
+    supply_kpa: Annotated[float | None, number(metavar="KPA", help="A known point: on the supply.")] = None,
+    bent_deg: Annotated[float | None, number(metavar="DEG", help="A known point: bent by hand to this angle.")] = None,
+    seconds: Annotated[float, number(metavar="S", min=0.5, max=600.0, help="For each thing that is listened to.")] = 5.0,
 ) -> int:
     """Zero of the sensors with the rig vented and at rest, gain and sign at a known point. Nothing is sent to a device."""
     from softloop.deploy.calibrate import Known

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from softloop.deploy.cli_app import EXIT_CODES, BenchArgument, app
+from softloop.deploy.cli_app import EXIT_CODES, BenchArgument, app, numbers
 
 if TYPE_CHECKING:
     from softloop.plant.config import PlantConfig
@@ -99,12 +99,8 @@ def valves(
     from softloop.deploy.bench import find_bench
     from softloop.deploy.experiment import Asked
     from softloop.deploy.experiment_valves import run_valves
-    from softloop.wire.errors import BadConfig
 
-    try:
-        supplies = tuple(float(text) for text in supply.split(","))
-    except ValueError:
-        raise BadConfig(f"--supply {supply}: give pressures with commas between, such as 150,175,200") from None
+    supplies = numbers("--supply", supply, "150,175,200")
     return run_valves(Asked(find_bench(bench), out, pace, quiet=quiet), supplies, ratios=ratios)
 
 

@@ -8,14 +8,14 @@ from typing import Annotated
 
 import typer
 
-from softloop.deploy.cli_app import BenchArgument, app, log_app
+from softloop.deploy.cli_app import BenchArgument, app, log_app, number
 from softloop.wire.errors import EXIT_OK
 
 
 @app.command()
 def doctor(
     bench: BenchArgument,
-    seconds: Annotated[float, typer.Option(metavar="S", min=0.5, max=3600.0, help="For each thing that is listened to.")] = 5.0,
+    seconds: Annotated[float, number(metavar="S", min=0.5, max=3600.0, help="For each thing that is listened to.")] = 5.0,
     certificate: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the outcome here too; `[run] certificate` puts it into each log.")
     ] = None,
@@ -29,7 +29,7 @@ def doctor(
 
 
 @app.command("doctor-ticks", hidden=True)
-def doctor_ticks(bench: BenchArgument, seconds: Annotated[float, typer.Option(metavar="S")] = 5.0) -> int:
+def doctor_ticks(bench: BenchArgument, seconds: Annotated[float, number(metavar="S")] = 5.0) -> int:
     """The doctor's helper: what a process of the 5 ms path sees of this machine, as JSON."""
     from softloop.deploy.bench import find_bench, load_bench
     from softloop.deploy.doctor_ticks import measure_as_child
@@ -53,7 +53,9 @@ def log_prune(
 @app.command()
 def install(
     to: Annotated[Path, typer.Option(metavar="DIR", help="Where the units go.")] = Path("/etc/systemd/system"),
-    user: Annotated[str, typer.Option(metavar="NAME", help="Who runs them; a user and a group of that name.")] = "softloop",
+    user: Annotated[
+        str, typer.Option(metavar="NAME", help="Who runs them, not root; a user and a group of that name.")
+    ] = "softloop",
     benches: Annotated[Path, typer.Option(metavar="DIR", help="The folder of bench files: NAME.toml for softloop@NAME.")] = Path(
         "/etc/softloop"
     ),

@@ -13,7 +13,7 @@ from pathlib import Path
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.hashes import SHA256
-from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from softloop.deploy.bench import PROCESS_NAMES, Bench, find_bench, load_bench
@@ -24,9 +24,12 @@ from softloop.wire.identity import (
     AUTHORITY,
     Identity,
     certificate_file,
+    check_time,
+    is_key_of,
     issued_by,
     key_file,
     load_certificate,
+    load_key,
     settings,
     wall_now,
 )
@@ -103,15 +106,20 @@ class _Maker:
         if anew or not certificate_file(self.folder, AUTHORITY).exists():
             self._make_authority()
         self.authority = load_certificate(self.folder, AUTHORITY)
+        check_time(certificate_file(self.folder, AUTHORITY), self.authority)
         self.authority_key = self._authority_key()
 
     def _authority_key(self) -> ec.EllipticCurvePrivateKey:
         file = key_file(self.folder, AUTHORITY)
         if not file.exists():
             raise Unavailable(f"{file}: the authority's key is not here; identities are made where it is kept")
-        key = load_pem_private_key(file.read_bytes(), None)
-        if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != self.authority.public_key():
-            raise Unavailable(f"{file}: is not the key of {certificate_file(self.folder, AUTHORITY)}")
+        key = load_key(file)
+        if not isinstance(key, ec.EllipticCurvePrivateKey):
+            raise Unavailable(f"{file}: is no elliptic-curve key; bring back the one that `softloop keys` made")
+        if not is_key_of(key, self.authority):
+            raise Unavailable(
+                f"{file}: is not the key of {certificate_file(self.folder, AUTHORITY)}; bring back the two of one pair"
+            )
         return key
 
     def _make_authority(self) -> None:

@@ -14,6 +14,7 @@ from softloop.wire.errors import Unavailable
 from softloop.wire.rights import FOLLOWER, LAUNCHER, RIGHTS, Rights, access_control, common_name, rights_of
 
 if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
     from cryptography.x509 import Certificate
 
 AUTHORITY = "ca"
@@ -118,7 +119,7 @@ def check_identity(folder: Path, bench: str, name: str) -> str:
     if not issued_by(own, authority):
         raise Unavailable(f"{where}: is not of the authority in {certificate_file(folder, AUTHORITY)}")
     for what, certificate in ((where, own), (certificate_file(folder, AUTHORITY), authority)):
-        _check_time(what, certificate)
+        check_time(what, certificate)
     left = min(own.not_valid_after_utc, authority.not_valid_after_utc) - wall_now()
     return f"identity '{name}' expires in {left.days} days; see `softloop keys --renew`" if left < SOON else ""
 
@@ -131,42 +132,65 @@ def load_certificate(folder: Path, name: str) -> Certificate:
     try:
         return x509.load_pem_x509_certificate(file.read_bytes())
     except OSError as error:
-        raise Unavailable(f"{file}: cannot be read: {error.strerror}; `softloop keys` makes it") from None
+        raise Unavailable(f"{file}: cannot be read: {error.strerror}; `softloop keys` makes what is missing") from None
     except ValueError:
-        raise Unavailable(f"{file}: is no certificate") from None
+        raise Unavailable(f"{file}: is no certificate; {_anew(file)}") from None
+
+
+def load_key(file: Path) -> PrivateKeyTypes:
+    """The key of an identity, or of the authority. Raises Unavailable."""
+    from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 - as above
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key  # noqa: PLC0415 - as above
+
+    try:
+        return load_pem_private_key(file.read_bytes(), None)
+    except OSError as error:
+        raise Unavailable(f"{file}: cannot be read: {error.strerror}; `softloop keys` makes what is missing") from None
+    except (ValueError, TypeError, UnsupportedAlgorithm):
+        raise Unavailable(f"{file}: is no key without a password; {_anew(file)}") from None
+
+
+def is_key_of(key: PrivateKeyTypes, certificate: Certificate) -> bool:
+    """Whether a key belongs to a certificate, whose own may be of a kind that nobody here knows."""
+    from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 - as above
+
+    try:
+        return key.public_key() == certificate.public_key()
+    except (ValueError, UnsupportedAlgorithm):
+        return False
+
+
+def _anew(file: Path) -> str:
+    """What helps where a certificate or a key is no good."""
+    if file.stem == AUTHORITY:
+        return "bring back the right one, or `softloop keys --renew --authority` makes everybody's keys anew"
+    return "`softloop keys --renew` makes it anew"
 
 
 def issued_by(certificate: Certificate, authority: Certificate) -> bool:
     """Whether the authority signed a certificate."""
-    from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 - as above
+    from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm  # noqa: PLC0415 - as above
 
     try:
         certificate.verify_directly_issued_by(authority)
-    except (ValueError, TypeError, InvalidSignature):
+    except (ValueError, TypeError, InvalidSignature, UnsupportedAlgorithm):
         return False
     return True
 
 
 def _check_key(file: Path, certificate: Certificate) -> None:
-    from cryptography.hazmat.primitives.serialization import load_pem_private_key  # noqa: PLC0415 - as above
-
-    try:
-        others = stat.S_IMODE(file.stat().st_mode) & 0o077
-        key = load_pem_private_key(file.read_bytes(), None)
-    except OSError as error:
-        raise Unavailable(f"{file}: cannot be read: {error.strerror}; `softloop keys` makes it") from None
-    except (ValueError, TypeError):
-        raise Unavailable(f"{file}: is no key without a password") from None
-    if others:
+    key = load_key(file)
+    if stat.S_IMODE(file.stat().st_mode) & 0o077:
         raise Unavailable(f"{file}: others may read it; chmod 600 it, and make it anew if they did")
-    if key.public_key() != certificate.public_key():
+    if not is_key_of(key, certificate):
         raise Unavailable(f"{file}: is not the key of the certificate beside it; `softloop keys --renew` makes both anew")
 
 
-def _check_time(file: Path, certificate: Certificate) -> None:
+def check_time(file: Path, certificate: Certificate) -> None:
+    """See that a certificate is good now. Raises Unavailable."""
     now = wall_now()
     if now > certificate.not_valid_after_utc:
-        raise Unavailable(f"{file}: expired on {certificate.not_valid_after_utc:%Y-%m-%d}; `softloop keys --renew` makes it anew")
+        raise Unavailable(f"{file}: expired on {certificate.not_valid_after_utc:%Y-%m-%d}; {_anew(file)}")
     if now < certificate.not_valid_before_utc:
         raise Unavailable(
             f"{file}: is good from {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC only; is this computer's clock right?"

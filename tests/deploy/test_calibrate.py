@@ -111,6 +111,15 @@ def test_rest_and_a_known_point_at_once_are_refused(folder, capsys):
     assert "one after the other" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--rest-deg", "--chamber-kpa", "--supply-kpa", "--bent-deg"])
+def test_what_is_no_number_is_refused_and_the_piece_stays(folder, option, capsys):
+    piece = folder / "calibration.toml"
+    piece.write_text("[inclinometer]\nzero_deg = 0.0\n")
+    assert softloop("calibrate", bench(folder), "--output", piece, option, "nan") == 2
+    assert f"'{option}': nan is not a finite number" in capsys.readouterr().err
+    assert piece.read_text() == "[inclinometer]\nzero_deg = 0.0\n"
+
+
 @pytest.mark.parametrize(
     ("head", "piece", "error", "said"),
     [

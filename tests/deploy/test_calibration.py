@@ -108,6 +108,17 @@ def test_an_angle_that_cannot_be_is_refused(counts, known, said):
     assert said in found.refused[0]
 
 
+@pytest.mark.parametrize("known", [float("nan"), float("inf"), float("-inf")])
+def test_a_known_value_that_is_no_number_gives_nothing(known):
+    volts = c.volts_of(readings(1.0, 1.0, 100.0))
+    for found in (
+        c.sensor_gain("chamber", SENSOR, volts, known),
+        c.inclinometer_zero(IMU, angles(45.0), known),
+        c.inclinometer_sign(IMU, angles(45.0), known),
+    ):
+        assert (found.keys, len(found.refused)) == ({}, 1)
+
+
 def test_what_several_looks_brought_is_one():
     whole = c.joined([c.Found({("a", "b"): 1.0}, ["x"]), c.Found({}, [], ["no"])])
     assert (whole.keys, whole.lines, whole.refused) == ({("a", "b"): 1.0}, ["x"], ["no"])

@@ -3,6 +3,7 @@
 import configparser
 import json
 import os
+import pwd
 import shutil
 import stat
 import subprocess
@@ -11,7 +12,10 @@ import tempfile
 from pathlib import Path
 
 import pytest
+import typer
 
+from softloop.deploy.cli import app
+from softloop.deploy.install import OWN_FOLDERS, install
 from softloop.deploy.node import KEPT_PROCESSES
 from softloop.deploy.services import Setting, in_a_home, needed, out_of_reach, units
 from softloop.wire import errors
@@ -141,7 +145,21 @@ def test_systemd_would_find_something_wrong(tmp_path):
         (("--to", ".", "--user", "a\nExecStartPre=/bin/evil"), 2, "cannot stand in a unit"),
         (("--to", ".", "--user", ""), 2, "cannot stand in a unit"),
         (("--to", ".", "--benches", "/etc/$HOME"), 2, "cannot stand in a unit"),
+        (("--to", ".", "--user", "root"), 2, "is root"),
+        (("--to", ".", "--user", "0"), 2, "not first a digit"),
+        (("--to", ".", "--user", "-x"), 2, "not first a digit"),
+        (("--to", ".", "--user", "Rig"), 2, "a name is a-z"),
+        (("--to", ".", "--user", "rig.one"), 2, "a name is a-z"),
+        (("--to", ".", "--user", "r" * 33), 2, "at most 32 signs"),
         (("--to", ".", "--cpus", "all"), 2, "cores by number"),
+        (("--to", ".", "--cpus", ", ,"), 2, "cores by number"),
+        (("--to", ".", "--cpus", " "), 2, "cores by number"),
+        (("--to", ".", "--cpus", "-"), 2, "cores by number"),
+        (("--to", ".", "--cpus", "1,,2"), 2, "cores by number"),
+        (("--to", ".", "--cpus", "1-2-3"), 2, "cores by number"),
+        (("--to", ".", "--cpus", "0\n1"), 2, "cores by number"),
+        (("--to", ".", "--cpus", "99-1"), 2, "99-1 goes down; write 1-99"),
+        (("--to", ".", "--cpus", "0-99999"), 2, "no machine has a core 99999"),
         (("--to", ".", "--host", "a b"), 2, "a name is a-z"),
     ],
 )
@@ -151,6 +169,48 @@ def test_a_mistake_is_one_line_and_writes_nothing(arguments, code, said, tmp_pat
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (code, "", 1)
     assert said in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("cpus", ["", "0", "0-0", "0,0", "0 0", "0 , 0", " 0"])
+def test_cores_that_are_here_are_taken_as_they_are_given(cpus, tmp_path, capsys):
+    assert install(tmp_path, Setting(PROGRAM, cpus=cpus)) == 0
+    assert "no core" not in capsys.readouterr().out
+    assert (f"CPUAffinity={cpus}\n" in (tmp_path / "softloop@.service").read_text()) == bool(cpus)
+
+
+def test_cores_that_are_not_here_are_refused_for_this_machine_and_said_of_another(tmp_path, capsys, monkeypatch):
+    here = os.sysconf("SC_NPROCESSORS_CONF")
+    for cpus in (f"0-{here}", f"0,{here}"):
+        assert install(tmp_path, Setting(PROGRAM, cpus=cpus)) == 0
+        assert f"warning: --cpus {cpus}: this machine has no core {here}; it has {here}, from 0 on" in capsys.readouterr().out
+        assert f"CPUAffinity={cpus}\n" in (tmp_path / "softloop@.service").read_text()
+    own = tmp_path / "own"
+    own.mkdir()
+    (tmp_path / "link").symlink_to(own)
+    monkeypatch.setattr("softloop.deploy.install.OWN_FOLDERS", (own,))
+    for to in (own, tmp_path / "link"):
+        with pytest.raises(errors.BadConfig, match=f"this machine has no core {here}"):
+            install(to, Setting(PROGRAM, cpus=f"0-{here}"))
+    assert list(own.iterdir()) == []
+    assert install(own, Setting(PROGRAM, cpus=f"0-{here - 1}")) == 0
+
+
+def test_where_units_go_without_a_word_is_this_machines():
+    command = typer.main.get_command(app).commands["install"]
+    assert next(p.default for p in command.params if p.name == "to") in OWN_FOLDERS
+
+
+def test_another_name_of_root_is_root_too(tmp_path, monkeypatch):
+    monkeypatch.setattr("pwd.getpwnam", lambda name: pwd.struct_passwd((name, "x", 0, 0, "", "/root", "/bin/sh")))
+    with pytest.raises(errors.BadConfig, match="--user toor: is root"):
+        install(tmp_path, Setting(PROGRAM, user="toor"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("user", ["rig", "_rig", "rig-2_b", "r" * 32])
+def test_names_that_useradd_takes_are_good(user, tmp_path):
+    assert install(tmp_path, Setting(PROGRAM, user=user)) == 0
+    assert f"User={user}\n" in (tmp_path / "softloop@.service").read_text()
 
 
 def test_a_second_install_replaces_the_first_and_what_is_left_is_said(tmp_path):

@@ -9,6 +9,15 @@ from datetime import timedelta
 import pytest
 import zenoh
 from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    PublicFormat,
+)
 
 from softloop.deploy import keys
 from softloop.deploy.bench import load_bench
@@ -117,6 +126,88 @@ def test_a_folder_without_the_authoritys_key_makes_nothing(file, tmp_path):
     with pytest.raises(Unavailable, match="the authority's key is not here"):
         make(file, renew=True)
     assert check_identity(tmp_path / "keys", NAME, "valves") == ""
+
+
+KEY = ec.generate_private_key(ec.SECP256R1())
+
+
+def pem(key, password=None):
+    shut = BestAvailableEncryption(password) if password else NoEncryption()
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, shut)
+
+
+def one_line(file, *words):
+    """What `softloop keys` says on standard error, with exit code 3."""
+    command = [sys.executable, "-m", "softloop.deploy.cli", "keys", str(file), *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (3, "", 1), done.stderr
+    return done.stderr
+
+
+@pytest.mark.parametrize(
+    ("secret", "said"),
+    [
+        (b"", "is no key without a password"),
+        (b"nonsense", "is no key without a password"),
+        (b"-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----\n", "is no key without a password"),
+        (b"\xff\x00" * 40, "is no key without a password"),
+        (pem(KEY, b"secret"), "is no key without a password"),
+        (KEY.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo), "is no key without a password"),
+        (pem(ed25519.Ed25519PrivateKey.generate()), "is no elliptic-curve key"),
+        (pem(KEY), "is not the key of"),
+    ],
+    ids=["empty", "text", "garbled", "bytes", "password", "public", "ed25519", "another"],
+)
+def test_an_authoritys_key_that_is_none_is_said_and_nothing_is_made(file, tmp_path, secret, said):
+    make(file)
+    key_file(tmp_path / "keys", "ca").write_bytes(secret)
+    before = content(tmp_path / "keys")
+    with pytest.raises(Unavailable, match=f"ca.key: {said}.*bring back"):
+        make(file, renew=True)
+    assert content(tmp_path / "keys") == before
+
+
+def test_the_command_says_what_is_wrong_with_an_authority(file, tmp_path):
+    make(file)
+    key_file(tmp_path / "keys", "ca").write_bytes(b"")
+    assert "ca.key: is no key without a password; bring back the right one" in one_line(file, "--renew")
+    certificate_file(tmp_path / "keys", "ca").write_bytes(b"")
+    assert "ca.pem: is no certificate; bring back the right one" in one_line(file, "--renew")
+    make(file, renew=True, authority=True)  # as the line says
+    assert check_identity(tmp_path / "keys", NAME, "valves") == ""
+
+
+@pytest.mark.parametrize("whose", ["ca.key", "guest.pem", "nonsense", "garbled"])
+def test_an_authoritys_certificate_that_is_none_is_said_and_nothing_is_made(file, tmp_path, whose):
+    make(file)
+    folder = tmp_path / "keys"
+    good = certificate_file(folder, "ca").read_bytes()
+    of = {"nonsense": b"nonsense", "garbled": good.replace(b"\nMII", b"\nAAA")}
+    certificate_file(folder, "ca").write_bytes(of.get(whose) or (folder / whose).read_bytes())
+    before = content(folder)
+    with pytest.raises(Unavailable, match=r"ca.pem(: is no certificate; |; )bring back"):
+        make(file, renew=True)
+    assert content(folder) == before
+
+
+def test_an_authority_that_has_expired_makes_nothing(file, tmp_path, monkeypatch):
+    make(file)
+    before = content(tmp_path / "keys")
+    for where in (i, keys):
+        monkeypatch.setattr(where, "wall_now", lambda: wall_now() + timedelta(days=keys.AUTHORITY_DAYS + 2))
+    with pytest.raises(Unavailable, match=r"ca.pem: expired on .*--renew --authority"):
+        make(file, renew=True)
+    assert content(tmp_path / "keys") == before
+
+
+def test_a_key_of_a_kind_that_nobody_here_knows_is_none(tmp_path, monkeypatch):
+    def unknown(data, password):
+        raise UnsupportedAlgorithm("a curve of tomorrow")
+
+    monkeypatch.setattr("cryptography.hazmat.primitives.serialization.load_pem_private_key", unknown)
+    (tmp_path / "ca.key").write_bytes(pem(KEY))
+    with pytest.raises(Unavailable, match="is no key without a password"):
+        i.load_key(tmp_path / "ca.key")
 
 
 def test_what_cannot_be_used_is_said_before_zenoh_is_asked(file, tmp_path, monkeypatch):
