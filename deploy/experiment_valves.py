@@ -8,17 +8,20 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from softloop.deploy.bench import Bench
 from softloop.deploy.config import CalibrationConfig
 from softloop.deploy.experiment import Asked, Place, begin, run_one
 from softloop.dynamics.parameters import Parameters
 from softloop.offline.identification.intervals import Uncertainty
 from softloop.offline.identification.tank_tests import (
+    LEAST_KPA,
     VALVES,
     Volume,
     Windows,
@@ -29,6 +32,7 @@ from softloop.offline.identification.tank_tests import (
 )
 from softloop.offline.identification.valve_flow import NAMES, FlowTests, ValveFit
 from softloop.offline.run_log import open_run
+from softloop.plant.config import SUPPLY_KPA
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
 
 SUPPLIES_KPA = (150.0, 175.0, 200.0)
@@ -80,8 +84,7 @@ def check(place: Place, supplies_kpa: tuple[float, ...], *, ratios: bool) -> Non
             f"{file}: flow tests of the valves need a known volume on the port, and there is no table [calibration] that "
             "declares a tank (tank_ml); with --ratios the rig's own pressure gives ratios to its volume"
         )
-    if len(set(supplies_kpa)) < LEAST_SUPPLIES:
-        raise BadConfig(f"--supply: {LEAST_SUPPLIES} different pressures or more are needed, got {len(set(supplies_kpa))}")
+    check_supplies(place, supplies_kpa)
     limit = bench.valves.pressure_max_kpa if bench.valves else 0.0
     top = SMALL["top_kpa"] if ratios else bench.controller.valve_test.top_kpa if bench.controller else 0.0
     if top + ENVELOPE_KPA > limit:
@@ -89,6 +92,28 @@ def check(place: Place, supplies_kpa: tuple[float, ...], *, ratios: bool) -> Non
                         f"valves.pressure_max_kpa ({limit:g}), got {top:g}")  # fmt: skip
     if bench.plant is None and not sys.stdin.isatty():
         raise BadConfig("experiment valves: somebody at a terminal has to set the supply's regulator between the runs")
+
+
+def check_supplies(place: Place, supplies_kpa: tuple[float, ...]) -> None:
+    """Enough different pressures, each one that the supply can be set to and its sensor can read. Raises BadConfig."""
+    different = {run_name(supply) for supply in supplies_kpa}
+    if len(different) < LEAST_SUPPLIES:
+        raise BadConfig(f"--supply: {LEAST_SUPPLIES} different pressures or more are needed, got {len(different)}")
+    if len(different) < len(supplies_kpa):
+        raise BadConfig("--supply: a pressure is there twice; give each once")
+    most, why = _highest(place.bench)
+    for supply in supplies_kpa:
+        if not LEAST_KPA < supply <= most:  # not true of a NaN either
+            raise BadConfig(f"--supply: {supply:g} kPa: must be above {LEAST_KPA:g}, or too little lies across a valve, "
+                            f"and at most {most:g}, {why}")  # fmt: skip
+
+
+def _highest(bench: Bench) -> tuple[float, str]:
+    """The highest supply pressure, kPa, and what makes it so."""
+    bounds = [(bench.pressures.supply.span_kpa, "pressures.supply.span_kpa of its sensor")] if bench.pressures else []
+    if bench.plant is not None:
+        bounds.append((SUPPLY_KPA[1], "the limit of plant.supply_kpa"))
+    return min(bounds, default=(inf, "no limit"))
 
 
 def run_name(supply_kpa: float) -> str:
