@@ -67,7 +67,7 @@ def _check_vent(bench: Bench, controller: Controller) -> None:
         )
         if shut - vent < VENT_PART * (shut - full):
             raise BadConfig(
-                f"key 'valves.vent_current_ma': {gate.vent_current_ma:g} mA vents {pressure_kpa:g} kPa at {shut - vent:.0f} kPa/s "
-                f"by the model of '{bench.controller.parameters}'; full current does at {shut - full:.0f} kPa/s, and at least "
-                f"half of that is needed"
+                f"key 'valves.vent_current_ma': {gate.vent_current_ma:g} mA vents {pressure_kpa:g} kPa at {shut - vent:.0f} "
+                f"kPa/s by the model of '{bench.controller.parameters}'; full current does at {shut - full:.0f} kPa/s, "
+                f"and at least half of that is needed"
             )

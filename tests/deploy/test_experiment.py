@@ -119,7 +119,7 @@ def test_a_real_supply_is_bounded_by_what_its_sensor_reads(tmp_path):
     place = begin(Asked(bench_with(tmp_path, "[calibration]\ntank_ml = 500.0\n", "real"), tmp_path / "x"), "valves")
     check_supplies(place, (150.0, 200.0, 250.0))
     for bad in (900.0, float("nan"), float("inf"), -5.0):
-        with pytest.raises(BadConfig, match="at most 250, pressures.supply.span_kpa of its sensor"):
+        with pytest.raises(BadConfig, match=r"at most 250, pressures.supply.span_kpa of its sensor"):
             check_supplies(place, (150.0, 200.0, bad))
 
 
