@@ -93,6 +93,10 @@ def valves(
     ratios: Annotated[
         bool, typer.Option("--ratios", help="On the actuator itself, without a tank: ratios to its unknown volume.")
     ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.toml", help="Write the controller's parameters with both valves as measured; tank only."),
+    ] = None,
     quiet: Quiet = False,
 ) -> int:
     """Flow tests of both valves on the tank of [calibration], as for Fig. 4; exit code 1 where they show nothing of a valve."""
@@ -105,7 +109,7 @@ def valves(
         supplies = tuple(float(text) for text in supply.split(","))
     except ValueError:
         raise BadConfig(f"--supply {supply}: give pressures with commas between, such as 150,175,200") from None
-    return run_valves(Asked(find_bench(bench), out, pace, quiet=quiet), supplies, ratios=ratios)
+    return run_valves(Asked(find_bench(bench), out, pace, quiet=quiet), supplies, ratios=ratios, output=output)
 
 
 @app.command(epilog=EXIT_CODES)
