@@ -18,7 +18,7 @@ from rich.table import Table
 from softloop.deploy.bench import Bench
 from softloop.deploy.config import CalibrationConfig
 from softloop.deploy.destination import check_destination
-from softloop.deploy.experiment import Asked, Place, begin, run_one
+from softloop.deploy.experiment import Asked, Place, begin, check_free, run_one
 from softloop.deploy.valve_parameters import RUN_PREFIX, TankRuns, check_identities, write_valves
 from softloop.dynamics.parameters import Parameters
 from softloop.offline.identification.intervals import Uncertainty
@@ -74,6 +74,7 @@ def run_valves(asked: Asked, supplies_kpa: tuple[float, ...], *, ratios: bool, o
     check(place, supplies_kpa, ratios=ratios)
     if output is not None:
         check_output(place, output)
+    check_free(place, map(run_name, supplies_kpa))
     for supply in supplies_kpa:
         set_supply(place, supply)
         code = run_one(place, run_name(supply), changes(place, supply, ratios=ratios))

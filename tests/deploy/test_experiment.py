@@ -78,6 +78,22 @@ def test_a_bench_without_a_controller_or_a_folder_that_cannot_be_is_refused(tmp_
         begin(Asked(find_bench(Path("sim")), tmp_path / "file" / "x"), "pressure")
 
 
+def test_a_used_folder_is_refused_before_the_first_run_by_the_option_that_named_it(tmp_path):
+    place = begin(Asked(find_bench(Path("sim")), tmp_path / "x"), "pressure")
+    (tmp_path / "x" / "b").mkdir()
+    (tmp_path / "x" / "b" / "bench.toml").write_text("")
+    with pytest.raises(Unavailable, match="holds the run 'b' already; name another folder with --out"):
+        run_all(place, {"a": {}, "b": {}})
+    assert not (tmp_path / "x" / "a.toml").exists()
+
+
+@pytest.mark.parametrize("pace", ["batch", "lockstep"])
+def test_a_real_rig_at_a_simulated_pace_is_refused_in_the_words_that_asked_for_it(tmp_path, pace):
+    with pytest.raises(BadConfig, match=rf"real\.toml: --pace {pace}: {pace} needs the tables \[plant\]"):
+        begin(Asked(find_bench(Path("real")), tmp_path / "x", pace), "pressure")
+    assert not (tmp_path / "x").exists()
+
+
 @pytest.mark.parametrize(("limit", "refused"), [(119.9, True), (120.0, False)])
 def test_an_excitation_must_fit_into_the_gates_envelope(tmp_path, limit, refused):
     place = begin(Asked(bench_with(tmp_path, f"[valves]\npressure_max_kpa = {limit}\n"), tmp_path / "x"), "pressure")
