@@ -187,7 +187,7 @@ def _check_together(bench: Bench, source: Source) -> None:
             where = tuple(key[1].split(".")) if key else (name,)
             raise BadConfig(f"{source.origin(where)}: {error}") from None
     if bench.pace.mode == "lockstep":
-        _check_lockstep(bench, source)
+        check_lockstep(bench, source.file)
     _check_buses(bench, source)
     _check_router(bench, source)
     try:
@@ -223,25 +223,29 @@ def _check_router(bench: Bench, source: Source) -> None:
         )
 
 
-def _check_lockstep(bench: Bench, source: Source) -> None:
-    """What waits for real time cannot be in a run that stands still while it waits. Raises BadConfig."""
+def check_lockstep(bench: Bench, file: Path, pace: str = "lockstep", asked: str = "key 'pace.mode'") -> None:
+    """What waits for real time cannot be in a run that stands still while it waits, nor in one of one process. Raises BadConfig.
+
+    Args:
+        pace: lockstep, or batch, which is lockstep in one process.
+        asked: where that pace was asked for.
+    """
     if bench.plant is None or bench.valves is None or bench.controller is None:
         raise BadConfig(
-            f"{source.file}: key 'pace.mode': lockstep needs the tables [plant], [valves] and [controller]: "
-            "real devices do not wait for a tick"
+            f"{file}: {asked}: {pace} needs the tables [plant], [valves] and [controller]: real devices do not wait for a tick"
         )
     if bench.valves.driver != "rig":
-        raise BadConfig(f"{source.file}: key 'valves.driver': must be \"rig\" at lockstep pace, as the simulated driver is one")
+        raise BadConfig(f"{file}: key 'valves.driver': must be \"rig\" at {pace} pace, as the simulated driver is one")
     if bench.plant.faults_from != "start":
-        raise BadConfig(f"{source.file}: key 'plant.faults_from': must be \"start\" at lockstep pace, where arming is planned")
+        raise BadConfig(f"{file}: key 'plant.faults_from': must be \"start\" at {pace} pace, where arming is planned")
     late = next((i.kind for i in bench.faults.injections if i.needs_wall), None)
     if late is not None:
-        raise BadConfig(f"{source.file}: key 'faults.injections': kind '{late}' needs wall pace")
+        raise BadConfig(f"{file}: key 'faults.injections': kind '{late}' needs wall pace")
     talking = next((name for name, bus in bench.can.items() if bus.emulation is not None and bus.emulation.bus_errors), None)
     if talking is not None:
-        raise BadConfig(f"{source.file}: key 'can.{talking}.emulation.bus_errors': must be false at lockstep pace")
+        raise BadConfig(f"{file}: key 'can.{talking}.emulation.bus_errors': must be false at {pace} pace")
     if bench.inclinometer is not None and bench.inclinometer.configure:
-        raise BadConfig(f"{source.file}: key 'inclinometer.configure': must be false at lockstep pace")
+        raise BadConfig(f"{file}: key 'inclinometer.configure': must be false at {pace} pace")
 
 
 def _chain(path: Path) -> list[tuple[Path, dict[str, Any]]]:

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from softloop.deploy.cli_app import EXIT_CODES, BenchArgument, app, number
+from softloop.offline.tuning_ranges import RANGES
 
 
 @app.command(epilog=EXIT_CODES)
@@ -72,7 +73,7 @@ def shadow(
 
 @app.command()
 def tune(
-    law: Annotated[str, typer.Argument(metavar="LAW", help="pid, pid_eso, smc, arc or arc_eso.")],
+    law: Annotated[str, typer.Argument(metavar="LAW", help=f"One of {', '.join(RANGES)}.")],
     seeds: Annotated[str, typer.Option(metavar="A:B", help="Tuning rigs; judge on others.")] = "1000:1008",
     added_ms: Annotated[float, number(metavar="MS", min=0.0, max=150.0, help="Latency added to the rig's own.")] = 0.0,
     evaluations: Annotated[int, typer.Option(metavar="N", min=1, help="At least so many.")] = 500,

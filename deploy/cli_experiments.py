@@ -93,6 +93,10 @@ def valves(
     ratios: Annotated[
         bool, typer.Option("--ratios", help="On the actuator itself, without a tank: ratios to its unknown volume.")
     ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.toml", help="Write the controller's parameters with both valves as measured; tank only."),
+    ] = None,
     quiet: Quiet = False,
 ) -> int:
     """Flow tests of both valves on the tank of [calibration], as for Fig. 4; exit code 1 where they show nothing of a valve."""
@@ -101,7 +105,7 @@ def valves(
     from softloop.deploy.experiment_valves import run_valves
 
     supplies = numbers("--supply", supply, "150,175,200")
-    return run_valves(Asked(find_bench(bench), out, pace, quiet=quiet), supplies, ratios=ratios)
+    return run_valves(Asked(find_bench(bench), out, pace, quiet=quiet), supplies, ratios=ratios, output=output)
 
 
 @app.command(epilog=EXIT_CODES)

@@ -42,7 +42,7 @@ def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty
     if not runs or bare_of(fit.structure) != PAPER:
         raise BadConfig("--output needs logs, orders 2,0,3 and one pressure: that is the model which the controller has")
     log = open_run(runs[0])
-    content = _base(log)
+    content = base_of(log)
     content |= {"name": file.stem, "bending": _bending(sure, series[0])}
     content["evidence"] = _evidence([runs[0], *runs], log, fit, sure, series)
     try:
@@ -64,7 +64,8 @@ def rig_of(log: Log) -> str:
     return str(run.get("rig") or log.bench)
 
 
-def _base(log: Log) -> dict[str, Any]:
+def base_of(log: Log) -> dict[str, Any]:
+    """The parameter file that a run had, as it stands. Raises BadFile."""
     try:
         return tomllib.loads(log.text("parameters.toml") or shipped().read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
@@ -90,11 +91,16 @@ def _evidence(runs: Sequence[Path], log: Log, fit: Fit, sure: Uncertainty, serie
     }
 
 
+def sha256_of(run: Path) -> str:
+    """Of a run's log, all its parts in their order."""
+    return hashlib.sha256(b"".join(part.read_bytes() for part in parts_of(find_log(run)))).hexdigest()
+
+
 def _run(path: Path, fit: Fit, series: Series, *, trained: bool) -> dict[str, Any]:
     counted = series.time_s[series.counted]
     return {
         "name": series.name,
-        "sha256": hashlib.sha256(b"".join(part.read_bytes() for part in parts_of(find_log(path)))).hexdigest(),
+        "sha256": sha256_of(path),
         "start_s": float(counted[0]),
         "end_s": float(counted[-1]),
         "fit_percent": fit.fits[0] if trained else score(fit, series),

@@ -6,7 +6,7 @@ addresses, limits of the gate and all else are the bench's, simulated or real, a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import gmtime, strftime
@@ -15,7 +15,8 @@ from typing import Any, Literal
 import tomlkit
 
 from softloop.controller.config import ControllerConfig
-from softloop.deploy.bench import Bench, load_bench
+from softloop.deploy.bench import Bench, check_lockstep, load_bench
+from softloop.deploy.run_dir import BENCH_FILE
 from softloop.wire.benchfile import read_toml
 from softloop.wire.errors import EXIT_OK, BadConfig, Unavailable
 
@@ -68,12 +69,21 @@ def begin(asked: Asked, kind: str) -> Place:
     for table in ("valves", "controller", "recorder"):
         if getattr(bench, table) is None:
             raise BadConfig(f"{asked.bench}: an experiment needs the table [{table}]")
+    if asked.pace in ("lockstep", "batch"):
+        check_lockstep(bench, asked.bench, asked.pace, f"--pace {asked.pace}")
     folder = asked.out or Path(bench.run.folder) / f"{bench.name}-{kind}-{strftime('%Y%m%dT%H%M%SZ', gmtime())}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise Unavailable(f"{folder}: cannot be made: {error.strerror or error}") from None
     return Place(folder, asked, bench)
+
+
+def check_free(place: Place, names: Iterable[str]) -> None:
+    """None of an experiment's runs is in its folder yet. Raises Unavailable, before the first one."""
+    for name in names:
+        if (place.run_dir(name) / BENCH_FILE).exists():
+            raise Unavailable(f"{place.folder}: holds the run '{name}' already; name another folder with --out")
 
 
 def run_one(place: Place, name: str, changes: Mapping[str, Any]) -> int:
@@ -123,6 +133,7 @@ def bench_file(place: Place, name: str, changes: Mapping[str, Any]) -> Path:
 
 def run_all(place: Place, runs: Mapping[str, Mapping[str, Any]]) -> int:
     """The runs one after the other; the first exit code that is not EXIT_OK, and none is started after it."""
+    check_free(place, runs)
     for name, changes in runs.items():
         code = run_one(place, name, changes)
         if code != EXIT_OK:

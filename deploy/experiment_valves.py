@@ -8,17 +8,22 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from softloop.deploy.bench import Bench
 from softloop.deploy.config import CalibrationConfig
-from softloop.deploy.experiment import Asked, Place, begin, run_one
+from softloop.deploy.destination import check_destination
+from softloop.deploy.experiment import Asked, Place, begin, check_free, run_one
+from softloop.deploy.valve_parameters import RUN_PREFIX, TankRuns, check_identities, write_valves
 from softloop.dynamics.parameters import Parameters
 from softloop.offline.identification.intervals import Uncertainty
 from softloop.offline.identification.tank_tests import (
+    LEAST_KPA,
     VALVES,
     Volume,
     Windows,
@@ -29,6 +34,7 @@ from softloop.offline.identification.tank_tests import (
 )
 from softloop.offline.identification.valve_flow import NAMES, FlowTests, ValveFit
 from softloop.offline.run_log import open_run
+from softloop.plant.config import SUPPLY_KPA
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
 
 SUPPLIES_KPA = (150.0, 175.0, 200.0)
@@ -52,23 +58,35 @@ class Found:
     hidden: tuple[str, ...]
 
 
-def run_valves(asked: Asked, supplies_kpa: tuple[float, ...], *, ratios: bool) -> int:
+def run_valves(asked: Asked, supplies_kpa: tuple[float, ...], *, ratios: bool, output: Path | None = None) -> int:
     """Test, fit, show; EXIT_NEGATIVE where a valve's tests show none of its numbers. Raises as `softloop run` does.
 
     Args:
         supplies_kpa: gauge; three or more, from different runs of the regulator.
         ratios: on the actuator itself, whose volume is not known: ratios to it.
+        output: where a parameter file with the valves as measured goes; only from a tank.
     """
+    if ratios and output is not None:
+        raise BadConfig(
+            "--output: a parameter file needs areas, and --ratios gives only ratios to an unknown volume; leave one out"
+        )
     place = begin(asked, "valves")
     check(place, supplies_kpa, ratios=ratios)
+    if output is not None:
+        check_output(place, output)
+    check_free(place, map(run_name, supplies_kpa))
     for supply in supplies_kpa:
         set_supply(place, supply)
         code = run_one(place, run_name(supply), changes(place, supply, ratios=ratios))
         if code != EXIT_OK:
             return code
-    found = judge(place, supplies_kpa, ratios=ratios)
+    found, on_tank = judge(place, supplies_kpa, ratios=ratios)
     if not asked.quiet:
         show(place, found, ratios=ratios)
+    if output is not None and on_tank is not None:
+        write_valves(output, on_tank)
+        if not asked.quiet:
+            Console(highlight=False).print(f"parameters: {output}", soft_wrap=True)
     return EXIT_OK if all(f.sure is not None for f in found.values()) else EXIT_NEGATIVE
 
 
@@ -80,8 +98,7 @@ def check(place: Place, supplies_kpa: tuple[float, ...], *, ratios: bool) -> Non
             f"{file}: flow tests of the valves need a known volume on the port, and there is no table [calibration] that "
             "declares a tank (tank_ml); with --ratios the rig's own pressure gives ratios to its volume"
         )
-    if len(set(supplies_kpa)) < LEAST_SUPPLIES:
-        raise BadConfig(f"--supply: {LEAST_SUPPLIES} different pressures or more are needed, got {len(set(supplies_kpa))}")
+    check_supplies(place, supplies_kpa)
     limit = bench.valves.pressure_max_kpa if bench.valves else 0.0
     top = SMALL["top_kpa"] if ratios else bench.controller.valve_test.top_kpa if bench.controller else 0.0
     if top + ENVELOPE_KPA > limit:
@@ -91,8 +108,38 @@ def check(place: Place, supplies_kpa: tuple[float, ...], *, ratios: bool) -> Non
         raise BadConfig("experiment valves: somebody at a terminal has to set the supply's regulator between the runs")
 
 
+def check_output(place: Place, output: Path) -> None:
+    """The file can be written, and the parameters beside the valves are this rig's. Raises BadFile or BadConfig."""
+    check_destination(output, "--output")
+    evidence, run = parameters_of(place).evidence, place.bench.run
+    if evidence is not None and place.bench.controller is not None:
+        check_identities(evidence.rig, run.rig or place.bench.name, place.bench.controller.parameters)
+
+
+def check_supplies(place: Place, supplies_kpa: tuple[float, ...]) -> None:
+    """Enough different pressures, each one that the supply can be set to and its sensor can read. Raises BadConfig."""
+    different = {run_name(supply) for supply in supplies_kpa}
+    if len(different) < LEAST_SUPPLIES:
+        raise BadConfig(f"--supply: {LEAST_SUPPLIES} different pressures or more are needed, got {len(different)}")
+    if len(different) < len(supplies_kpa):
+        raise BadConfig("--supply: a pressure is there twice; give each once")
+    most, why = _highest(place.bench)
+    for supply in supplies_kpa:
+        if not LEAST_KPA < supply <= most:  # not true of a NaN either
+            raise BadConfig(f"--supply: {supply:g} kPa: must be above {LEAST_KPA:g}, or too little lies across a valve, "
+                            f"and at most {most:g}, {why}")  # fmt: skip
+
+
+def _highest(bench: Bench) -> tuple[float, str]:
+    """The highest supply pressure, kPa, and what makes it so."""
+    bounds = [(bench.pressures.supply.span_kpa, "pressures.supply.span_kpa of its sensor")] if bench.pressures else []
+    if bench.plant is not None:
+        bounds.append((SUPPLY_KPA[1], "the limit of plant.supply_kpa"))
+    return min(bounds, default=(inf, "no limit"))
+
+
 def run_name(supply_kpa: float) -> str:
-    return f"supply_{supply_kpa:g}"
+    return f"{RUN_PREFIX}{supply_kpa:g}"
 
 
 def set_supply(place: Place, supply_kpa: float) -> None:
@@ -111,22 +158,24 @@ def changes(place: Place, supply_kpa: float, *, ratios: bool) -> dict[str, Any]:
     return {"controller": controller} | ({"plant": {"supply_kpa": supply_kpa}} if place.bench.plant is not None else {})
 
 
-def judge(place: Place, supplies_kpa: tuple[float, ...], *, ratios: bool) -> dict[str, Found]:
+def judge(place: Place, supplies_kpa: tuple[float, ...], *, ratios: bool) -> tuple[dict[str, Found], TankRuns | None]:
     """What all runs together say of each valve; leaves RESULT, and the figure where there is a tank. Raises BadFile."""
     parameters = parameters_of(place)
     discharge, volume = parameters.pneumatics.discharge, volume_of(place.bench.calibration, parameters, ratios=ratios)
     logs = [open_run(place.run_dir(run_name(s))) for s in supplies_kpa]
     parts = [flow_tests(log, volume, SMALL_WINDOWS if ratios else Windows()) for log in logs]
     tests = {valve: joined([p[valve] for p in parts]) for valve in VALVES}
+    on_tank = None
     if ratios:
         found = {valve: _of_ratios(tests[valve], volume, discharge) for valve in VALVES}
     else:
         fits = {valve: fit_on_tank(tests[valve], volume, discharge) for valve in VALVES}
         found = {valve: _of_fit(fit) for valve, fit in fits.items()}
+        on_tank = TankRuns(logs, parts, fits, volume, discharge)
         _draw(place.folder, tests, fits, discharge, volume.temperature_k)
     content = {v: as_dict(f) | {"tests": len(tests[v].flow_kg_s), "logs": [str(x.path) for x in logs]} for v, f in found.items()}
     (place.folder / RESULT).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    return found
+    return found, on_tank
 
 
 def parameters_of(place: Place) -> Parameters:

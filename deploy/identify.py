@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from softloop.deploy.destination import check_destination
 from softloop.deploy.evidence import write_evidence
 from softloop.deploy.progress import counted_progress
 from softloop.dynamics.parameters import load_parameters, shipped
@@ -62,6 +63,9 @@ class Answer:
 
 def identify(asked: Asked) -> int:
     """Do what was asked and say it. Raises BadFile or BadConfig."""
+    for option, file in (("--output", asked.output), ("--figure", asked.figure)):
+        if file is not None:
+            check_destination(file, option)
     train, validate = _data(asked)
     structure = _structure(asked, train.pressure_kpa.shape[1])
     if asked.select:

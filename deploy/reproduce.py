@@ -105,6 +105,8 @@ def run_reproduce(wanted: Wanted) -> int:
 
 def _folder(wanted: Wanted) -> Path:
     folder = wanted.out or Path("runs") / f"reproduce-{strftime('%Y%m%dT%H%M%SZ', gmtime())}"
+    if folder.exists() and not folder.is_dir():
+        raise Unavailable(f"{folder}: is a file, and a folder is made there; name another with --out")
     if folder.exists() and any(folder.iterdir()):
         raise Unavailable(f"{folder}: is not empty; name another with --out")
     try:

@@ -9,8 +9,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress, TextColumn
 
-from softloop.offline.tuning import RANGES, Latency, as_toml, summary, tune
-from softloop.wire.errors import EXIT_OK, BadConfig
+from softloop.deploy.destination import check_destination
+from softloop.offline.tuning import Latency, as_toml, summary, tune
+from softloop.offline.tuning_ranges import RANGES
+from softloop.wire.errors import EXIT_OK, BadConfig, BadFile
 
 
 def seeds_of(text: str) -> tuple[int, ...]:
@@ -25,13 +27,22 @@ def seeds_of(text: str) -> tuple[int, ...]:
     return tuple(seeds)
 
 
+def _write(out: Path, text: str) -> None:
+    try:
+        out.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise BadFile(f"--out {out}: cannot be written: {error.strerror or error}") from None
+
+
 def run_tune(
     law: str, seeds: str, added_ms: float, evaluations: int, search_seed: int, out: Path | None, *, as_json: bool
 ) -> int:
-    """Search, write the gains to `out` (or print them). Raises BadConfig."""
+    """Search, write the gains to `out` (or print them). Raises BadConfig, or BadFile before the search where `out` cannot be."""
     if law not in RANGES:
         raise BadConfig(f"law '{law}' cannot be tuned; these can: {', '.join(RANGES)}")
     rigs = seeds_of(seeds)
+    if out is not None:
+        check_destination(out, "--out")
     with Progress(
         *Progress.get_default_columns(), TextColumn("best {task.fields[best]}"), console=Console(stderr=True), transient=True,
         disable=not sys.stderr.isatty(),
@@ -43,7 +54,7 @@ def run_tune(
 
         found = tune(law, Latency(added_ms), rigs, evaluations, search_seed, show)
     if out is not None:
-        out.write_text(as_toml(found))
+        _write(out, as_toml(found))
     if as_json:
         print(json.dumps(summary(found)))
     elif out is None:

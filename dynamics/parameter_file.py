@@ -68,12 +68,15 @@ class EvidenceRun(Table):
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="of the log file")
     start_s: float = Field(description="the window that counted, from the run's first tick")
     end_s: float
-    fit_percent: float = Field(description="NRMSE fit of a free simulation")
+    fit_percent: float = Field(description="NRMSE fit of a free simulation; of flow tests, of their flow")
     trained: bool
 
 
 class Evidence(Table):
-    """Where the bending values come from. Their bounds hold three standard errors of what they do together."""
+    """Where the bending values come from, and the valves' where a tank was used.
+
+    The bounds of the bending hold three standard errors of what its values do together.
+    """
 
     rig: str = Field(description="identity of the rig, as its bench says it: run.rig, or the bench's name")
     method: str = Field(description="estimator, and what its residuals were taken for")

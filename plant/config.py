@@ -14,6 +14,7 @@ from softloop.wire.can_config import CanConfig
 from softloop.wire.errors import BadConfig
 
 LEAST_TANK_ML = 100.0
+SUPPLY_KPA = (20.0, 240.0)  # a regulated supply is set above the first and to no more than the second, gauge
 
 
 class SensorConfig(Table):
@@ -81,7 +82,9 @@ class SpecimenConfig(ProcessTable):
     step_us: int = Field(400, ge=10, le=1000, description="longest integration step; pieces between events are shorter")
     supply_sensor: SensorConfig = SensorConfig()
     chamber_sensor: SensorConfig = SensorConfig()
-    supply_kpa: float | None = Field(None, gt=20, le=240, description="what the supply is set to, gauge; default: drawn by seed")
+    supply_kpa: float | None = Field(
+        None, gt=SUPPLY_KPA[0], le=SUPPLY_KPA[1], description="what the supply is set to, gauge; default: drawn by seed"
+    )
     tank_ml: float = Field(0.0, ge=0, le=20_000, description="a rigid, isothermal tank on the port, not the actuator; 0: none")
     ambient_c: float | None = Field(None, ge=-20, le=60, description="of room, air and silicone; default: drawn by seed")
     pressure_rise_ms: float = Field(3.0, ge=0, description="10 to 90 % of the sensors; none in the ideal layer")

@@ -91,6 +91,12 @@ def _steps(log: Log) -> list[tuple[bool, int, int]]:
     return [(bool(asked[a] > 0.0), int(stamps[a]), int(stamps[b - 1])) for a, b in pairwise(edges) if asked[a] != 0.0]
 
 
+def span_s(log: Log) -> tuple[float, float]:
+    """From the first current to the end of the last one, s from the run's first tick."""
+    steps, first_ns = _steps(log), int(log["cycle"]["stamp_ns"][0])
+    return 1e-9 * (steps[0][1] - first_ns), 1e-9 * (steps[-1][2] - first_ns)
+
+
 def _row(log: Log, charging: bool, start_ns: int, end_ns: int, volume: Volume) -> tuple[float, float, float, float] | None:
     """Current, upstream and downstream pressure and flow of one window; None where it says nothing."""
     samples, words = _within(log["pressure"], start_ns, end_ns), _within(log["valves"], start_ns, end_ns)
@@ -119,8 +125,13 @@ def fit_on_tank(tests: FlowTests, volume: Volume, discharge: float) -> ValveFit:
     sure = found.uncertainty
     if sure is None:
         return found
-    share = volume.error * sure.values * WITH_VOLUME[[NAMES.index(n) for n in sure.names]]
+    share = shared_error(sure, volume)
     return replace(found, uncertainty=replace(sure, covariance=sure.covariance + np.outer(share, share)))
+
+
+def shared_error(sure: Uncertainty, volume: Volume) -> Floats:
+    """One standard error of the tank's volume, in each of a valve's numbers."""
+    return np.asarray(volume.error * sure.values * WITH_VOLUME[[NAMES.index(n) for n in sure.names]], np.float64)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from softloop.deploy import cli
 from softloop.deploy.gate_requests import Requests, ask
 from softloop.deploy.launcher import Options
 from softloop.deploy.prepare import kernel_modules
+from softloop.offline.tuning_ranges import RANGES
 from softloop.wire.errors import EXIT_ENVIRONMENT, EXIT_INTERRUPTED, EXIT_NEGATIVE, EXIT_OK, EXIT_USAGE
 
 TOY = str(Path(__file__).with_name("toy_node.py"))
@@ -64,6 +65,8 @@ port = "/dev/null"
         (("router", "sim", "--with", "zenohd2"), EXIT_USAGE, "'zenohd2'"),
         (("request", "sim", "fly"), EXIT_USAGE, "'fly'"),
         (("report", "/no/such/run"), EXIT_USAGE, "/no/such/run"),
+        (("tune", "pid", "--out", "/no/such/x.toml"), EXIT_USAGE, "--out /no/such/x.toml: there is no folder /no/such"),
+        (("tune", "pid", "--out", "/tmp"), EXIT_USAGE, "--out /tmp: is a folder"),
     ],
 )
 def test_a_mistake_is_one_line_on_standard_error(arguments, code, said):
@@ -83,6 +86,11 @@ def test_help_tells_the_exit_codes_and_loads_nothing_heavy():
     program = "import sys, softloop.deploy.cli; print([m for m in ('zenoh', 'numpy', 'pydantic', 'rich') if m in sys.modules])"
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
     assert loaded.stdout.strip() == "[]"
+
+
+def test_the_help_of_tune_names_every_law_that_can_be_tuned():
+    said = " ".join(softloop("tune", "--help").stdout.split())
+    assert f"One of {', '.join(RANGES)}." in said
 
 
 def test_a_fault_of_ours_is_one_line_too(monkeypatch, capsys):

@@ -12,7 +12,7 @@ from softloop.deploy.bench import find_bench, load_bench
 from softloop.deploy.experiment import Asked, begin, bench_file, run_all
 from softloop.deploy.experiment_pressure import check_envelope, controller_of
 from softloop.deploy.experiment_tracking import check_laws, paper_of
-from softloop.deploy.experiment_valves import check
+from softloop.deploy.experiment_valves import check, check_supplies
 from softloop.wire.errors import BadConfig, Unavailable
 
 
@@ -78,6 +78,22 @@ def test_a_bench_without_a_controller_or_a_folder_that_cannot_be_is_refused(tmp_
         begin(Asked(find_bench(Path("sim")), tmp_path / "file" / "x"), "pressure")
 
 
+def test_a_used_folder_is_refused_before_the_first_run_by_the_option_that_named_it(tmp_path):
+    place = begin(Asked(find_bench(Path("sim")), tmp_path / "x"), "pressure")
+    (tmp_path / "x" / "b").mkdir()
+    (tmp_path / "x" / "b" / "bench.toml").write_text("")
+    with pytest.raises(Unavailable, match="holds the run 'b' already; name another folder with --out"):
+        run_all(place, {"a": {}, "b": {}})
+    assert not (tmp_path / "x" / "a.toml").exists()
+
+
+@pytest.mark.parametrize("pace", ["batch", "lockstep"])
+def test_a_real_rig_at_a_simulated_pace_is_refused_in_the_words_that_asked_for_it(tmp_path, pace):
+    with pytest.raises(BadConfig, match=rf"real\.toml: --pace {pace}: {pace} needs the tables \[plant\]"):
+        begin(Asked(find_bench(Path("real")), tmp_path / "x", pace), "pressure")
+    assert not (tmp_path / "x").exists()
+
+
 @pytest.mark.parametrize(("limit", "refused"), [(119.9, True), (120.0, False)])
 def test_an_excitation_must_fit_into_the_gates_envelope(tmp_path, limit, refused):
     place = begin(Asked(bench_with(tmp_path, f"[valves]\npressure_max_kpa = {limit}\n"), tmp_path / "x"), "pressure")
@@ -99,6 +115,13 @@ def test_flow_tests_need_a_tank_that_the_bench_declares(tmp_path):
     ("text", "supplies", "word"),
     [
         ("", (150.0, 200.0, 200.0), "3 different pressures"),
+        ("", (150.0, 175.0, 200.0, 200.0), "twice"),
+        ("", (150.0, 175.0, 900.0), r"900 kPa: must be .* at most 240, the limit of plant.supply_kpa"),
+        ("", (100.0, float("nan"), float("inf")), "nan kPa: must be"),
+        ("", (150.0, 175.0, float("inf")), "inf kPa: must be"),
+        ("", (150.0, -175.0, 200.0), "-175 kPa: must be above 20"),
+        ("", (0.0, 175.0, 200.0), "0 kPa: must be above 20"),
+        ("[pressures.supply]\nspan_kpa = 180.0\n", (150.0, 175.0, 200.0), "at most 180, pressures.supply.span_kpa"),
         ("[valves]\npressure_max_kpa = 165.0\n", (150.0, 175.0, 200.0), "at least 10 kPa below"),
     ],
 )
@@ -106,6 +129,14 @@ def test_flow_tests_that_would_say_too_little_or_go_too_far_are_refused(tmp_path
     place = begin(Asked(bench_with(tmp_path, text, "sim_tank"), tmp_path / "x"), "valves")
     with pytest.raises(BadConfig, match=word):
         check(place, supplies, ratios=False)
+
+
+def test_a_real_supply_is_bounded_by_what_its_sensor_reads(tmp_path):
+    place = begin(Asked(bench_with(tmp_path, "[calibration]\ntank_ml = 500.0\n", "real"), tmp_path / "x"), "valves")
+    check_supplies(place, (150.0, 200.0, 250.0))
+    for bad in (900.0, float("nan"), float("inf"), -5.0):
+        with pytest.raises(BadConfig, match=r"at most 250, pressures.supply.span_kpa of its sensor"):
+            check_supplies(place, (150.0, 200.0, bad))
 
 
 def test_somebody_must_be_there_to_set_a_real_supply(tmp_path, monkeypatch):

@@ -33,6 +33,8 @@ def test_a_folder_that_holds_something_is_refused(tmp_path):
     (tmp_path / "old.txt").write_text("")
     with pytest.raises(Unavailable, match="is not empty"):
         run_reproduce(Wanted(tmp_path, "batch", 0, "0:1", quiet=True))
+    with pytest.raises(Unavailable, match="is a file, and a folder"):
+        run_reproduce(Wanted(tmp_path / "old.txt", "batch", 0, "0:1", quiet=True))
     with pytest.raises(BadConfig, match="seeds"):
         run_reproduce(Wanted(tmp_path / "new", "batch", 0, "2:1", quiet=True))
     assert not (tmp_path / "new").exists()

@@ -41,7 +41,7 @@ def commands():
 def less(command):
     """With fewer rigs, at batch pace, and placeholders replaced."""
     words = [STANDS_FOR.get(word, word) for word in command]
-    if command[:3] == ["experiment", "valves", "BENCH"]:
+    if command[:2] == ["experiment", "valves"] and command[2] in ("BENCH", "my_rig.toml"):
         words[2] = "sim_tank"
     if command[0] == "experiment" and "--pace" not in command and "--over" not in command:
         words += ["--pace", "batch"]

@@ -14,7 +14,6 @@ from softloop.offline.tuning import (
     LOST,
     OVER_QUIET,
     QUIET_PER_S,
-    RANGES,
     Latency,
     as_toml,
     cost,
@@ -23,6 +22,7 @@ from softloop.offline.tuning import (
     tune,
     with_gains,
 )
+from softloop.offline.tuning_ranges import RANGES
 from softloop.plant.config import LoadConfig, PlantConfig
 
 GOOD = Trial(1.0, 0.5, steady_deg=0.3, switches_per_s=QUIET_PER_S, effort_ma_s=0.0, peak_deg=1.5, left_peak_deg=1.5)
