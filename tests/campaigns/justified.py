@@ -2,6 +2,10 @@
 
 JUSTIFIED = {
     "gate": {
+        "arm_is_new: if state.requesters == REQUESTERS and (i == 0 or state.arm_heard_ns[i] < state.arm_heard_ns[place]): -> "
+        "if state.requesters == REQUESTERS and (i == 0 or state.arm_heard_ns[i] <= state.arm_heard_ns[place]):": (
+            "Of two who were heard at the same instant the other one is forgotten, and either may be: both are too old to arm."
+        ),
         "change_state: if state.gate != before and state.gate != GATE_ARMED: -> if state.gate != before:": (
             "On arming, too, the venting would begin anew; but while armed nothing reads it, and every way out of ARMED sets "
             "both of its fields again."

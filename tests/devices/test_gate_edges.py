@@ -75,13 +75,14 @@ def test_a_pressure_that_is_none_leaves_the_last_one_standing(bad):
     assert outputs == [g.OUTPUT_VENT] * 4 + [g.OUTPUT_CLOSED]
 
 
-def test_a_fault_long_after_arming_vents_for_its_whole_time():
+@pytest.mark.parametrize("end", [{"stop": 1}, {"disarm": 1}, {"shutdown": 1}])
+def test_what_ends_a_long_arming_vents_for_its_whole_time(end):
     """The pressure that is left is between the one that ends venting and the one that keeps it up."""
     bench = GateBench(vent_time_s=1.0).armed()
     for _ in range(300):
         assert bench.tick().gate == g.GATE_ARMED
     left = {"chamber_pressure_kpa": 5.0}
-    outputs = [int(bench.tick(stop=1, **left).output)] + [int(bench.tick(**left).output) for _ in range(201)]
+    outputs = [int(bench.tick(**end, **left).output)] + [int(bench.tick(**left).output) for _ in range(201)]
     assert outputs == [g.OUTPUT_VENT] * 200 + [g.OUTPUT_CLOSED] * 2
 
 
@@ -151,6 +152,43 @@ def test_an_arm_request_that_answers_an_old_word_or_none_of_this_clock_does_not_
     assert bool(output.gate == g.GATE_ARMED) is arms
     assert output.refused == (g.REASON_NONE if arms else g.REASON_OLD_REQUEST)
     assert request(bench, 5, 2).gate == g.GATE_ARMED
+
+
+def test_no_request_is_refused_where_none_came():
+    bench = GateBench()
+    assert [int(bench.tick(arm_stamp_ns=stamp_ns).refused) for stamp_ns in (0, 1, bench.now_ns)] == [g.REASON_NONE] * 3
+
+
+def test_late_requests_are_not_remembered_for_they_take_the_place_of_others():
+    bench = GateBench()
+    bench.tick()
+    for origin in range(8):
+        assert request(bench, origin, 1, arm_stamp_ns=1).refused == g.REASON_OLD_REQUEST
+    assert request(bench, 8, 1).gate == g.GATE_ARMED
+
+
+def test_of_eight_the_one_not_heard_for_longest_is_forgotten_wherever_it_stands():
+    bench = GateBench()
+    bench.tick()
+    for origin in range(8):
+        request(bench, origin, 1, stop=1)
+    for origin in (0, 1, 2, 4, 5, 6, 7):
+        request(bench, origin, 2, stop=1, after_ns=200 * MS)
+    assert request(bench, 8, 1).gate == g.GATE_ARMED, "the fourth was heard more than a second ago, the first was not"
+    assert 3 not in bench.state.arm_origin
+
+
+def test_a_requester_of_number_0_is_one_as_any_other():
+    bench = GateBench()
+    bench.tick()
+    assert request(bench, 77, 1, stop=1).gate == g.GATE_FAULT
+    assert request(bench, 0, 0).gate == g.GATE_ARMED
+
+
+def test_the_config_is_the_bench_files_numbers_to_the_nanosecond():
+    config = GateBench(driver_silence_ms=37.0, vent_settle_s=0.25, vent_time_s=3.0, hold_ticks=2).config
+    assert (config.driver_silence_ns, config.vent_settle_ns, config.vent_time_ns) == (37 * MS, 250 * MS, 3000 * MS)
+    assert config.silence_ns == 3 * PERIOD_NS
 
 
 def test_a_stop_is_no_less_for_a_late_arm_request():
