@@ -21,8 +21,9 @@ from softloop.offline.identification.series import Series
 from softloop.offline.identification.structure import PAPER, bare_of
 from softloop.offline.log import Log
 from softloop.offline.run_log import find_log, open_run
+from softloop.offline.summary import judged
 from softloop.wire.benchfile import validated
-from softloop.wire.errors import BadConfig, BadFile
+from softloop.wire.errors import BadConfig, BadFile, printable
 from softloop.wire.log_parts import parts_of
 
 
@@ -53,6 +54,11 @@ def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty
         file.write_text(tomlkit.dumps(content), encoding="utf-8")
     except OSError as error:
         raise BadFile(f"{file}: cannot be written: {error.strerror or error}") from None
+
+
+def digest_of(run: Path) -> str:
+    """SHA-256 of all parts of a run's log. Raises BadFile."""
+    return hashlib.sha256(b"".join(part.read_bytes() for part in parts_of(find_log(run)))).hexdigest()
 
 
 def rig_of(log: Log) -> str:
@@ -92,11 +98,14 @@ def _evidence(runs: Sequence[Path], log: Log, fit: Fit, sure: Uncertainty, serie
 
 def _run(path: Path, fit: Fit, series: Series, *, trained: bool) -> dict[str, Any]:
     counted = series.time_s[series.counted]
+    damage, against = judged(open_run(path))
     return {
         "name": series.name,
-        "sha256": hashlib.sha256(b"".join(part.read_bytes() for part in parts_of(find_log(path)))).hexdigest(),
+        "sha256": digest_of(path),
         "start_s": float(counted[0]),
         "end_s": float(counted[-1]),
         "fit_percent": fit.fits[0] if trained else score(fit, series),
         "trained": trained,
+        "log_problems": [printable(text) for text in damage],
+        "evidence_problems": [printable(text) for text in against],
     }

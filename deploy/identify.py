@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from softloop.deploy.evidence import write_evidence
+from softloop.deploy.identify_words import say_faults
 from softloop.deploy.progress import counted_progress
 from softloop.dynamics.parameters import load_parameters, shipped
 from softloop.offline.identification.csv_map import parse_map, read_columns, read_csv, read_vent
@@ -26,6 +27,7 @@ from softloop.offline.identification.valve_flow import NAMES as VALVE_NAMES
 from softloop.offline.identification.valve_flow import FlowTests, fit_valve
 from softloop.offline.identification.venting import fit_vent, score_vent
 from softloop.offline.run_log import open_run
+from softloop.offline.summary import judged
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
 
 
@@ -150,9 +152,17 @@ def _data(asked: Asked) -> tuple[Series, list[Series]]:
         columns = parse_map(asked.columns)
         series = [read_csv(path, columns) for path in asked.csv]
         return series[0], series[1:]
-    series = [from_log(open_run(run), run.name) for run in asked.runs]
+    series = [_of_run(run, run.name) for run in asked.runs]
     first, second = halves(series[0])
     return first, [second, *series[1:]]
+
+
+def _of_run(run: Path, name: str) -> Series:
+    """A logged run as a series; what its log is not good for is said beforehand."""
+    log = open_run(run)
+    series = from_log(log, name)
+    say_faults(name, *judged(log))
+    return series
 
 
 def _structure(asked: Asked, inputs: int) -> Structure:
