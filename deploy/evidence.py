@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import tomllib
 from collections.abc import Sequence
 from importlib import metadata
@@ -13,6 +12,7 @@ import numpy as np
 import tomlkit
 from pydantic import ValidationError
 
+from softloop.deploy.identify_files import digest_of
 from softloop.dynamics.parameters import Parameters, shipped
 from softloop.offline.identification.bounds import bounds_of
 from softloop.offline.identification.intervals import Uncertainty
@@ -20,11 +20,10 @@ from softloop.offline.identification.output_error import Fit, score
 from softloop.offline.identification.series import Series
 from softloop.offline.identification.structure import PAPER, bare_of
 from softloop.offline.log import Log
-from softloop.offline.run_log import find_log, open_run
+from softloop.offline.run_log import open_run
 from softloop.offline.summary import judged
 from softloop.wire.benchfile import validated
 from softloop.wire.errors import BadConfig, BadFile, printable
-from softloop.wire.log_parts import parts_of
 
 
 def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty, series: Sequence[Series]) -> None:
@@ -56,11 +55,6 @@ def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty
         raise BadFile(f"{file}: cannot be written: {error.strerror or error}") from None
 
 
-def digest_of(run: Path) -> str:
-    """SHA-256 of all parts of a run's log. Raises BadFile."""
-    return hashlib.sha256(b"".join(part.read_bytes() for part in parts_of(find_log(run)))).hexdigest()
-
-
 def rig_of(log: Log) -> str:
     """The identity of the rig that a log is of."""
     try:
@@ -86,17 +80,21 @@ def _bending(sure: Uncertainty, train: Series) -> dict[str, dict[str, float]]:
 
 def _evidence(runs: Sequence[Path], log: Log, fit: Fit, sure: Uncertainty, series: Sequence[Series]) -> dict[str, Any]:
     kept = [sure.names.index(name) for name in PAPER.names]
+    # The second of `series` is the half of the first log that did not train.
+    trained = [i == 0 or (i > 1 and digest_of(path) == digest_of(runs[0])) for i, path in enumerate(runs)]
+    fits = [fit.fits[0], *(score(fit, s) for s in series[1:])]
+    rows = zip(runs, series, fits, trained, strict=True)
     return {
         "rig": rig_of(log),
         "method": f"{fit.structure}, {sure.method}",
         "softloop": metadata.version("softloop"),
         "parameters": list(PAPER.names),
         "covariance": sure.covariance[np.ix_(kept, kept)].tolist(),
-        "runs": [_run(path, fit, s, trained=i == 0) for i, (path, s) in enumerate(zip(runs, series, strict=True))],
+        "runs": [_run(path, s, percent, trained=t) for path, s, percent, t in rows],
     }
 
 
-def _run(path: Path, fit: Fit, series: Series, *, trained: bool) -> dict[str, Any]:
+def _run(path: Path, series: Series, fit_percent: float, *, trained: bool) -> dict[str, Any]:
     counted = series.time_s[series.counted]
     damage, against = judged(open_run(path))
     return {
@@ -104,7 +102,7 @@ def _run(path: Path, fit: Fit, series: Series, *, trained: bool) -> dict[str, An
         "sha256": digest_of(path),
         "start_s": float(counted[0]),
         "end_s": float(counted[-1]),
-        "fit_percent": fit.fits[0] if trained else score(fit, series),
+        "fit_percent": fit_percent,
         "trained": trained,
         "log_problems": [printable(text) for text in damage],
         "evidence_problems": [printable(text) for text in against],

@@ -1,9 +1,36 @@
 """What `softloop identify` says beside its answer, and what it refuses."""
 
+import json
+from pathlib import Path
+
+import models
+import numpy as np
 import pytest
 from test_command import softloop
+from test_venting import vent
 
+from softloop.deploy.identify_files import labels
 from softloop.dynamics.parameters import load_parameters
+
+MAP = ("--map", "time=t", "--map", "pressure=p", "--map", "angle=y")
+VENT_MAP = ("--map", "time=t", "--map", "pressure=p")
+
+
+def bend(file, seed=1, edit=lambda rows: rows):
+    """A CSV file of a known model, 10 s at 200 Hz."""
+    series = models.measured(models.PAPER, models.values_of(models.PAPER), seed=seed, seconds=10.0, noise_deg=0.05)
+    return save(file, "t,p,y", edit(np.column_stack([series.time_s, series.pressure_kpa[:, 0], series.angle_deg])))
+
+
+def tank(file, first_kpa, seed=1):
+    run = vent(first_kpa, 0.05, seed, seconds=10.0)
+    return save(file, "t,p", np.column_stack([run.time_s, run.pressure_kpa]))
+
+
+def save(file, head, rows):
+    file.parent.mkdir(exist_ok=True)
+    np.savetxt(file, rows, delimiter=",", header=head, comments="", fmt="%.9g")
+    return file
 
 
 @pytest.fixture
@@ -29,3 +56,30 @@ def test_a_log_that_is_cut_off_is_said_and_stands_in_the_parameter_file(cut_off,
 def test_of_a_whole_log_nothing_is_said(excitation, capsys):
     assert softloop("identify", excitation, "--method", "ls") == 0
     assert capsys.readouterr().err == ""
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders():
+    files = [Path("a/x/bend.csv"), Path("b/x/bend.csv"), Path("a/x/other.csv"), Path("a/x/bend.csv")]
+    assert labels(files, ending=False)[1:3] == ["b/x/bend", "other"]
+    assert len(set(labels(files, ending=False))) == 4
+    assert labels([Path("p/fast"), Path("q/fast")], ending=True) == ["p/fast", "q/fast"]
+    assert labels([Path("p/one"), Path("p/Data2")], ending=True, taken=("Data1", "Data2")) == ["one", "p/Data2"]
+
+
+def test_no_file_hides_another_and_the_training_data_are_not_unseen(tmp_path, capsys):
+    files = [bend(tmp_path / folder / "bend.csv", seed) for folder, seed in (("a", 1), ("b", 2), ("c", 1))]
+    csv = [f"--csv={file}" for file in files]
+    assert softloop("identify", *csv, *MAP, "--method", "ls") == 0
+    said = capsys.readouterr().out
+    assert "a/bend (trained) " in said
+    assert "b/bend (unseen) " in said
+    assert "c/bend (trained on) " in said
+
+
+def test_ventings_of_one_name_too(tmp_path, capsys):
+    files = [tank(tmp_path / folder / "tank.csv", kpa) for folder, kpa in (("a", 80.0), ("b", 40.0), ("c", 80.0))]
+    assert softloop("identify", "--venting", *(f"--csv={file}" for file in files), *VENT_MAP, "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert list(answer["train"]) == ["a/tank"]
+    assert list(answer["validate"]) == ["b/tank", "c/tank"]
+    assert answer["trained_on"] == ["c/tank"]
