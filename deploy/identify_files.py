@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from softloop.deploy.identify_words import say_faults
+from softloop.deploy.identify_words import say, say_faults
 from softloop.offline.identification.csv_map import Map, read_csv, read_vent
 from softloop.offline.identification.experiments import halves
 from softloop.offline.identification.series import Series, from_log
@@ -50,14 +50,14 @@ def of_runs(runs: Sequence[Path]) -> Data:
 def of_tables(files: Sequence[Path], columns: Map) -> Data:
     """CSV files: the first one trains. Raises BadFile."""
     names = labels(files, ending=False)
-    series = [replace(read_csv(file, columns), name=name) for file, name in zip(files, names, strict=True)]
+    series = [replace(read_csv(file, columns, say), name=name) for file, name in zip(files, names, strict=True)]
     return Data(series[0], series[1:], _seen(names, [_digest([file]) for file in files], 1))
 
 
 def of_vents(files: Sequence[Path], columns: Map, trained: int) -> Vents:
     """CSV files of ventings: the first `trained` of them train. Raises BadFile."""
     names = labels(files, ending=False)
-    runs = [replace(read_vent(file, columns), name=name) for file, name in zip(files, names, strict=True)]
+    runs = [replace(read_vent(file, columns, say), name=name) for file, name in zip(files, names, strict=True)]
     return Vents(runs[:trained], runs[trained:], _seen(names, [_digest([file]) for file in files], trained))
 
 
