@@ -48,6 +48,10 @@ def parse_map(entries: Sequence[str], needed: Sequence[str] = NEEDED, optional: 
         key, equals, columns = entry.partition("=")
         if not equals or key not in (*needed, *optional) or not columns:
             raise BadConfig(f"--map {entry}: must be KEY=COLUMN with KEY one of {', '.join((*needed, *optional))}")
+        if key in found:
+            raise BadConfig(
+                f"--map {entry}: '{key}' is given twice; give it once{', several columns by commas' * (key == 'pressure')}"
+            )
         found[key] = tuple(_column(text, entry) for text in columns.split(","))
         if key != "pressure" and len(found[key]) != 1:
             raise BadConfig(f"--map {entry}: only 'pressure' may have several columns")

@@ -83,3 +83,23 @@ def test_ventings_of_one_name_too(tmp_path, capsys):
     assert list(answer["train"]) == ["a/tank"]
     assert list(answer["validate"]) == ["b/tank", "c/tank"]
     assert answer["trained_on"] == ["c/tank"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fault"),
+    [
+        (("--venting", "--csv", "x.csv", "--output", "x.toml"), "identify --venting has no use for --output; leave it out"),
+        (("--venting", "--csv", "x.csv", "--figure", "x.png", "--method", "oe"), "no use for --method, --figure"),
+        (("RUN", "--venting", "--csv", "x.csv"), "identify --venting has no use for RUN..."),
+        (("--venting", *VENT_MAP), "identify --venting needs --csv FILE"),
+        (("RUN", "--train", "1"), "--train goes with --venting"),
+        (("RUN", "--map", "time=t"), "--map goes with --csv"),
+        (("--csv", "x.csv", *MAP, "--map", "time=u"), "'time' is given twice"),
+        (("RUN", "--select", "--output", "x.toml"), "identify --select compares orders, and has no use for --output"),
+    ],
+)
+def test_an_option_that_would_be_ignored_is_refused(capsys, arguments, fault):
+    assert softloop("identify", *arguments) == 2
+    error = capsys.readouterr().err
+    assert fault in error
+    assert error.count("\n") == 1

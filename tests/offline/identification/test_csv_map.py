@@ -32,6 +32,8 @@ def test_columns_are_taken_as_mapped_with_their_factors(tmp_path):
         (["time"], "KEY=COLUMN"),
         (["time=a,b"], "only 'pressure'"),
         (["time=a*x"], "'x' is no number"),
+        (["time=a", "pressure=p", "time=b"], "'time' is given twice; give it once$"),
+        (["pressure=p", "pressure=q"], "give it once, several columns by commas"),
     ],
 )
 def test_a_bad_map_is_one_clear_line(entries, fault):

@@ -1,0 +1,42 @@
+"""What `softloop identify` is asked, before anything is read or fitted: an option that would be ignored, a file that cannot be."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from softloop.wire.errors import BadConfig, BadFile
+
+OF_VENTING = {"venting", "csv", "columns", "train", "as_json"}
+NOT_OF_SELECT = {"orders", "method", "interval", "output", "figure"}
+
+
+def check_options(given: Mapping[str, str]) -> None:
+    """`given`: parameter -> how it is written, of those on the command line. Raises BadConfig on one that would be ignored."""
+    if "venting" in given:
+        _none_of(given, set(given) - OF_VENTING, "identify --venting")
+        if "csv" not in given:
+            raise BadConfig("identify --venting needs --csv FILE, with --map time=COLUMN and --map pressure=COLUMN")
+        return
+    if "train" in given:
+        raise BadConfig("identify: --train goes with --venting; without it the first file trains")
+    if "runs" in given and "columns" in given and "csv" not in given:
+        raise BadConfig("identify: --map goes with --csv FILE; a log knows its columns itself, leave --map out")
+    if "select" in given:
+        _none_of(given, set(given) & NOT_OF_SELECT, "identify --select compares orders, and")
+
+
+def _none_of(given: Mapping[str, str], idle: set[str], what: str) -> None:
+    if idle:
+        raise BadConfig(f"{what} has no use for {', '.join(given[name] for name in given if name in idle)}; leave it out")
+
+
+def check_destination(target: Path) -> None:
+    """Whether a file can be written there. Raises BadFile."""
+    if target.is_dir():
+        raise BadFile(f"{target}: is a folder; name a file in it")
+    if not target.parent.is_dir():
+        raise BadFile(f"{target}: there is no folder {target.parent}; make it first")
+    if not os.access(target if target.exists() else target.parent, os.W_OK):
+        raise BadFile(f"{target}: cannot be written: no permission; name another place")
