@@ -18,7 +18,7 @@ from softloop.offline.identification.bounds import bounds_of
 from softloop.offline.identification.intervals import Uncertainty
 from softloop.offline.identification.output_error import Fit, score
 from softloop.offline.identification.series import Series
-from softloop.offline.identification.structure import PAPER, bare_of
+from softloop.offline.identification.structure import PAPER, Structure, bare_of
 from softloop.offline.log import Log
 from softloop.offline.run_log import open_run
 from softloop.offline.summary import judged
@@ -39,8 +39,7 @@ def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty
         BadConfig: the structure is another, or the values make no usable parameter file.
         BadFile: the file cannot be written, or the values come from no log.
     """
-    if not runs or bare_of(fit.structure) != PAPER:
-        raise BadConfig("--output needs logs, orders 2,0,3 and one pressure: that is the model which the controller has")
+    check_usable(runs, fit.structure)
     log = open_run(runs[0])
     content = _base(log)
     content |= {"name": file.stem, "bending": _bending(sure, series[0])}
@@ -53,6 +52,12 @@ def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty
         file.write_text(tomlkit.dumps(content), encoding="utf-8")
     except OSError as error:
         raise BadFile(f"{file}: cannot be written: {error.strerror or error}") from None
+
+
+def check_usable(runs: Sequence[Path], structure: Structure) -> None:
+    """Whether a fit of that structure to those logs can make a parameter file. Raises BadConfig."""
+    if not runs or bare_of(structure) != PAPER:
+        raise BadConfig("--output needs logs, orders 2,0,3 and one pressure: that is the model which the controller has")
 
 
 def rig_of(log: Log) -> str:

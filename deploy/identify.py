@@ -10,7 +10,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from softloop.deploy.evidence import write_evidence
+from softloop.deploy.evidence import check_usable, write_evidence
+from softloop.deploy.identify_checks import check_destination
 from softloop.deploy.identify_files import Data, of_runs, of_tables, of_vents
 from softloop.deploy.progress import counted_progress
 from softloop.dynamics.parameters import load_parameters, shipped
@@ -62,9 +63,12 @@ class Answer:
 
 def identify(asked: Asked) -> int:
     """Do what was asked and say it. Raises BadFile or BadConfig."""
+    _check_files(asked)
     data = _data(asked)
     train, validate = data.train, data.validate
     structure = _structure(asked, train.pressure_kpa.shape[1])
+    if asked.output:
+        check_usable(asked.runs, structure)
     if asked.select:
         return _select(structure, data, as_json=asked.as_json)
     fit, uncertainty = fitted(structure, train, asked.method, asked.interval)
@@ -73,8 +77,9 @@ def identify(asked: Asked) -> int:
         write_evidence(asked.output, asked.runs, fit, uncertainty, [train, *validate])
     if asked.figure:
         from softloop.offline.identification.figures import validation  # noqa: PLC0415 - matplotlib only where it draws
+        from softloop.offline.vector import save  # noqa: PLC0415
 
-        validation(fit, [train, *validate]).savefig(asked.figure)
+        save(validation(fit, [train, *validate]), asked.figure)
     if asked.as_json:
         print(json.dumps(as_dict(answer), indent=2))
     else:
@@ -150,6 +155,16 @@ def _data(asked: Asked) -> Data:
     if asked.csv:
         return of_tables(asked.csv, parse_map(asked.columns))
     return of_runs(asked.runs)
+
+
+def _check_files(asked: Asked) -> None:
+    """Whether what is to be written can be, before a long fit. Raises BadFile or BadConfig."""
+    for target in filter(None, (asked.output, asked.figure)):
+        check_destination(target)
+    if asked.figure:
+        from softloop.offline.vector import format_of  # noqa: PLC0415 - matplotlib only where it draws
+
+        format_of(asked.figure)
 
 
 def _structure(asked: Asked, inputs: int) -> Structure:

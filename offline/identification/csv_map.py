@@ -64,9 +64,12 @@ def parse_map(entries: Sequence[str], needed: Sequence[str] = NEEDED, optional: 
 def _column(text: str, entry: str) -> Column:
     name, star, factor = text.partition("*")
     try:
-        return Column(name.strip(), float(factor) if star else 1.0)
+        column = Column(name.strip(), float(factor) if star else 1.0)
     except ValueError:
         raise BadConfig(f"--map {entry}: '{factor}' is no number") from None
+    if not np.isfinite(column.factor) or column.factor == 0.0:
+        raise BadConfig(f"--map {entry}: a factor must be a finite number other than 0, such as 0.001; not {factor}")
+    return column
 
 
 def read_csv(path: Path, columns: Map, say: Say = unheard) -> Series:

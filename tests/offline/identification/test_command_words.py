@@ -9,6 +9,7 @@ import pytest
 from test_command import softloop
 from test_venting import vent
 
+from softloop.deploy import identify
 from softloop.deploy.identify_files import labels
 from softloop.dynamics.parameters import load_parameters
 
@@ -103,3 +104,28 @@ def test_an_option_that_would_be_ignored_is_refused(capsys, arguments, fault):
     error = capsys.readouterr().err
     assert fault in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("option", "target", "fault"),
+    [
+        ("--figure", "nodir/x.png", "there is no folder"),
+        ("--figure", "x.xyz", "the ending says the format, one of: .svg, .pdf, .png"),
+        ("--figure", ".", "is a folder"),
+        ("--output", "nodir/x.toml", "there is no folder"),
+    ],
+)
+def test_where_nothing_can_be_written_is_said_before_the_fit(tmp_path, monkeypatch, capsys, option, target, fault):
+    monkeypatch.setattr(identify, "fitted", None)
+    file = bend(tmp_path / "bend.csv")
+    assert softloop("identify", "--csv", file, *MAP, option, tmp_path / target) == 2
+    error = capsys.readouterr().err
+    assert fault in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("rows", [0, 1, 99])
+def test_a_venting_of_few_rows_is_one_line(tmp_path, capsys, rows):
+    file = save(tmp_path / "tank.csv", "t,p", np.column_stack([np.arange(rows), 5.0 - 0.01 * np.arange(rows)]))
+    assert softloop("identify", "--venting", "--csv", file, *VENT_MAP) == 2
+    assert f"tank: {rows} samples; 100 or more of venting are needed" in capsys.readouterr().err

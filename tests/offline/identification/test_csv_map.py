@@ -32,6 +32,8 @@ def test_columns_are_taken_as_mapped_with_their_factors(tmp_path):
         (["time"], "KEY=COLUMN"),
         (["time=a,b"], "only 'pressure'"),
         (["time=a*x"], "'x' is no number"),
+        (["time=a*inf"], "a factor must be a finite number other than 0"),
+        (["time=a*0"], "a factor must be a finite number other than 0"),
         (["time=a", "pressure=p", "time=b"], "'time' is given twice; give it once$"),
         (["pressure=p", "pressure=q"], "give it once, several columns by commas"),
     ],
