@@ -150,7 +150,7 @@ def identify(
 def _given(context: typer.Context) -> dict[str, str]:
     """Parameters that stand on the command line -> how a person writes them."""
     there = (p for p in context.command.params if p.name)
-    written = {p.name: p.opts[0] if p.param_type_name == "option" else (p.metavar or p.human_readable_name) for p in there}
+    written = {p.name: p.opts[0] if p.param_type_name == "option" else (getattr(p, "metavar", None) or p.opts[0]) for p in there}
     sources = {name: context.get_parameter_source(name) for name in written if name}
     return {name: written[name] for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 
 from softloop.deploy.evidence import check_usable, write_evidence
 from softloop.deploy.identify_checks import check_destination
 from softloop.deploy.identify_files import Data, of_runs, of_tables, of_vents
+from softloop.deploy.identify_words import say
 from softloop.deploy.progress import counted_progress
 from softloop.dynamics.parameters import load_parameters, shipped
 from softloop.offline.identification.csv_map import parse_map, read_columns
@@ -20,6 +23,7 @@ from softloop.offline.identification.fitting import fit_output_error
 from softloop.offline.identification.intervals import Uncertainty, of_fit, of_regression
 from softloop.offline.identification.orders import compare
 from softloop.offline.identification.output_error import Fit, score
+from softloop.offline.identification.plausible import fit_hints, unit_hints
 from softloop.offline.identification.regression import as_fit, instrumental_variables, least_squares
 from softloop.offline.identification.series import Series
 from softloop.offline.identification.structure import PAPER, Structure, bare_of
@@ -27,6 +31,8 @@ from softloop.offline.identification.valve_flow import NAMES as VALVE_NAMES
 from softloop.offline.identification.valve_flow import FlowTests, fit_valve
 from softloop.offline.identification.venting import fit_vent, score_vent
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
+
+WIDEST = 10_000  # columns; no table is
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,8 @@ class Answer:
     train: Series
     scores: dict[str, float]
     seen: frozenset[str]  # names of those in `scores` that are the training data again
+    fit_s: float  # how long the fit took, with its intervals
+    hints: tuple[str, ...]
 
 
 def identify(asked: Asked) -> int:
@@ -69,10 +77,14 @@ def identify(asked: Asked) -> int:
     structure = _structure(asked, train.pressure_kpa.shape[1])
     if asked.output:
         check_usable(asked.runs, structure)
+    hints = _said(unit_hints([train, *validate]))  # before the fit, which wrong units may make long
     if asked.select:
         return _select(structure, data, as_json=asked.as_json)
+    begun_s = monotonic()
     fit, uncertainty = fitted(structure, train, asked.method, asked.interval)
-    answer = Answer(fit, uncertainty, train, {v.name: score(fit, v) for v in validate}, data.seen)
+    fit_s = monotonic() - begun_s
+    hints += _said(fit_hints({train.name: fit.fits[0]}))
+    answer = Answer(fit, uncertainty, train, {v.name: score(fit, v) for v in validate}, data.seen, fit_s, tuple(hints))
     if asked.output:
         write_evidence(asked.output, asked.runs, fit, uncertainty, [train, *validate])
     if asked.figure:
@@ -92,14 +104,16 @@ def identify_vent(files: tuple[Path, ...], columns: tuple[str, ...], trained: in
     if not 1 <= trained <= len(files):
         raise BadConfig(f"--train {trained}: must be 1 to {len(files)}, the number of files")
     data = of_vents(files, parse_map(columns, ("time", "pressure"), ("input",)), trained)
+    begun_s = monotonic()
     found = fit_vent(data.train)
+    fit_s = monotonic() - begun_s
     sure, (low, high) = found.uncertainty, found.uncertainty.interval()
     own = {r.name: fit for r, fit in zip(data.train, found.fits, strict=True)}
     scores = {r.name: score_vent(sure.values, r) for r in data.validate}
     if as_json:
         rows = {n: {"value": v, "low": a, "high": b} for n, v, a, b in zip(sure.names, sure.values, low, high, strict=True)}
         answer = {"parameters": rows, "train": own, "validate": scores, "trained_on": sorted(data.seen), "rank": found.rank}
-        print(json.dumps(answer, indent=2))
+        print(json.dumps({**answer, "fit_s": fit_s}, indent=2))
         return EXIT_OK
     for name, value, a, b in zip(sure.names, sure.values, low, high, strict=True):
         print(f"{name} {value:.4g} (95 %: {a:.4g} to {b:.4g})")
@@ -108,6 +122,7 @@ def identify_vent(files: tuple[Path, ...], columns: tuple[str, ...], trained: in
         print(f"  {name} (trained) {fit:.2f} %")
     for name, fit in scores.items():
         print(f"  {name} ({_seen(name, data.seen)}) {fit:.2f} %")
+    print(_took(fit_s))
     return EXIT_OK
 
 
@@ -157,6 +172,12 @@ def _data(asked: Asked) -> Data:
     return of_runs(asked.runs)
 
 
+def _said(hints: list[str]) -> list[str]:
+    for hint in hints:
+        say(hint)
+    return hints
+
+
 def _check_files(asked: Asked) -> None:
     """Whether what is to be written can be, before a long fit. Raises BadFile or BadConfig."""
     for target in filter(None, (asked.output, asked.figure)):
@@ -189,11 +210,13 @@ def as_dict(answer: Answer) -> dict[str, Any]:
         "train": {answer.train.name: answer.fit.fits[0]},
         "validate": answer.scores,
         "trained_on": sorted(answer.seen),
+        "fit_s": answer.fit_s,
+        "hints": list(answer.hints),
     }
 
 
 def _show(answer: Answer) -> None:
-    console, sure = Console(highlight=False), answer.uncertainty
+    sure = answer.uncertainty
     low, high = sure.interval()
     paper = _table1() if answer.fit.structure.inputs == 1 else {}
     shown = paper if set(PAPER.names) <= set(sure.names) else {}
@@ -203,10 +226,22 @@ def _show(answer: Answer) -> None:
     for i, name in enumerate(sure.names):
         beside = [shown.get(name, ("", ""))[0], shown.get(name, ("", ""))[1]] if shown else []
         table.add_row(name, f"{sure.values[i]:.5g}", f"{low[i]:.5g}", f"{high[i]:.5g}", *beside)
-    console.print(table)
+    _print_whole(table)
     print(f"fit by free simulation, NRMSE: {answer.train.name} (trained) {answer.fit.fits[0]:.2f} %")
     for name, fit in answer.scores.items():
         print(f"  {name} ({_seen(name, answer.seen)}) {fit:.2f} %")
+    print(_took(answer.fit_s))
+
+
+def _took(fit_s: float) -> str:
+    return f"fitted in {fit_s:.1f} s"
+
+
+def _print_whole(table: Table) -> None:
+    """A table as wide as it is: cut off at a narrow terminal's or a pipe's edge, it would lose digits."""
+    console = Console(highlight=False)
+    needed = Measurement.get(console, console.options.update(max_width=WIDEST), table).maximum
+    Console(highlight=False, width=max(console.width, needed)).print(table)
 
 
 def _seen(name: str, seen: frozenset[str]) -> str:
@@ -220,6 +255,7 @@ def _table1() -> dict[str, tuple[str, str]]:
 
 
 def _select(structure: Structure, data: Data, *, as_json: bool) -> int:
+    begun_s = monotonic()
     with counted_progress("fitting structures", quiet=as_json) as progress:
         choices = compare(structure, data.train, data.validate, progress)
     if as_json:
@@ -234,5 +270,6 @@ def _select(structure: Structure, data: Data, *, as_json: bool) -> int:
         s, mark = c.structure, " *" if c is best else ""
         fits = [f"{f:.2f}" for f in (c.fit, *c.validation)]
         table.add_row(f"{s.m}, {s.n}, {s.r}", str(len(s.names)), *fits, f"{c.schwarz:.4f}{mark}", " ".join(c.uncertain) or "-")
-    Console(highlight=False).print(table)
+    _print_whole(table)
+    print(_took(monotonic() - begun_s))
     return EXIT_OK

@@ -1,4 +1,4 @@
-"""What `softloop identify` is asked, before anything is read or fitted: an option that would be ignored, a file that cannot be."""
+"""Before `softloop identify` reads or fits anything: an option that would be ignored, a file that cannot be written."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def _column(text: str, entry: str) -> Column:
 
 
 def read_csv(path: Path, columns: Map, say: Say = unheard) -> Series:
-    """One file as a series; `say` takes a line about rows that are left out. Raises BadFile: one line with file, row and fault."""
+    """One file as a series; `say` hears of rows that are left out. Raises BadFile: one line with file, row and fault."""
     table = _wanted(path, columns)
 
     def taken(key: str) -> list[Floats]:
@@ -126,8 +126,8 @@ def _check_gap(path: Path, time_s: Floats, rows: NDArray[np.int64]) -> None:
     longest = min(GAP_STEPS * usual, max(GAP_S, GAP_LEAST_STEPS * usual))
     if steps[worst] > longest * (1.0 + ROUNDING):
         raise BadFile(
-            f"{path}: row {rows[worst + 1]}: a gap of {steps[worst]:.4g} s before it, where rows are usually {usual:.4g} s apart; "
-            f"cut the file there, and give the parts as files of their own"
+            f"{path}: row {rows[worst + 1]}: a gap of {steps[worst]:.4g} s before it, where rows are usually {usual:.4g} s "
+            f"apart; cut the file there, and give the parts as files of their own"
         )
 
 

@@ -1,6 +1,7 @@
 """What `softloop identify` says beside its answer, and what it refuses."""
 
 import json
+import re
 from pathlib import Path
 
 import models
@@ -56,7 +57,9 @@ def test_a_log_that_is_cut_off_is_said_and_stands_in_the_parameter_file(cut_off,
 
 def test_of_a_whole_log_nothing_is_said(excitation, capsys):
     assert softloop("identify", excitation, "--method", "ls") == 0
-    assert capsys.readouterr().err == ""
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert re.search(r"^fitted in \d+\.\d s$", said.out, re.M)
 
 
 def test_files_of_one_name_are_told_apart_by_their_folders():
@@ -129,3 +132,26 @@ def test_a_venting_of_few_rows_is_one_line(tmp_path, capsys, rows):
     file = save(tmp_path / "tank.csv", "t,p", np.column_stack([np.arange(rows), 5.0 - 0.01 * np.arange(rows)]))
     assert softloop("identify", "--venting", "--csv", file, *VENT_MAP) == 2
     assert f"tank: {rows} samples; 100 or more of venting are needed" in capsys.readouterr().err
+
+
+def test_strange_units_and_a_poor_fit_are_hinted_at(tmp_path, capsys):
+    file = bend(tmp_path / "bend.csv", edit=lambda rows: np.column_stack([rows[:, 0], rows[:, 1], np.sin(1e4 * rows[:, 0])]))
+    mapped = ("--map", "time=t*1000", "--map", "pressure=p*0.001", "--map", "angle=y*0.1")
+    assert softloop("identify", "--csv", file, *mapped, "--method", "ls", "--json") == 0
+    said = capsys.readouterr()
+    hints = json.loads(said.out)["hints"]
+    assert [f"softloop: {hint}" for hint in hints] == said.err.splitlines()
+    assert hints[0].startswith("bend: a sample every 5 s and a range of pressure of 0.1")
+    assert "and a range of the angle of 0.2 deg: are the units s, kPa and deg?" in hints[0]
+    assert re.match(r"bend: a fit of -?\d+\.\d\d % where it was trained: ", hints[1])
+    assert len(hints) == 2
+
+
+def test_no_table_is_cut_at_80_columns(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    name = "a_long_name_for_a_run_that_bends_and_bends_again"
+    files = [bend(tmp_path / folder / f"{name}.csv", seed) for folder, seed in (("first", 1), ("second", 2))]
+    assert softloop("identify", *(f"--csv={file}" for file in files), *MAP, "--method", "ls") == 0
+    out = capsys.readouterr().out
+    assert "\N{HORIZONTAL ELLIPSIS}" not in out
+    assert " to " in next(line for line in out.splitlines() if " a0 " in line)

@@ -87,5 +87,5 @@ def test_what_is_a_gap_depends_on_the_usual_step(usual_s, gap_s, taken):
     if taken:
         assert len(rising(Path("x.csv"), time_s, print)) == 60
         return
-    with pytest.raises(BadFile, match="x.csv: row 32: a gap"):
+    with pytest.raises(BadFile, match=r"x\.csv: row 32: a gap"):
         rising(Path("x.csv"), time_s, print)
