@@ -77,20 +77,16 @@ def _seen(names: Sequence[str], digests: Sequence[str], trained: int) -> frozens
 def labels(files: Sequence[Path], *, ending: bool, taken: Sequence[str] = ()) -> list[str]:
     """A name for each file: its own, with so many of its folders as tell it from the others; `taken` are not free."""
     parts = [_parts(file, ending=ending) for file in files]
-    depth = [1] * len(files)
-
-    def named() -> list[str]:
-        return ["/".join(p[-d:]) for p, d in zip(parts, depth, strict=True)]
-
+    depth = dict.fromkeys(parts, 1)  # a file that is given twice is here once
     for _ in range(max(map(len, parts), default=0)):
-        count = Counter([*named(), *taken])
-        depth = [d + (count[name] > 1) for name, d in zip(named(), depth, strict=True)]
-    return _numbered(named(), taken)
+        count = Counter([*("/".join(p[-d:]) for p, d in depth.items()), *taken])
+        depth = {p: d + (count["/".join(p[-d:])] > 1) for p, d in depth.items()}
+    return _numbered(["/".join(p[-depth[p] :]) for p in parts], taken)
 
 
-def _parts(file: Path, *, ending: bool) -> list[str]:
+def _parts(file: Path, *, ending: bool) -> tuple[str, ...]:
     whole = file.resolve() if file.name in ("", "..") else file.absolute()
-    return [*whole.parts[1:-1], whole.name if ending else whole.stem]
+    return (*whole.parts[1:-1], whole.name if ending else whole.stem)
 
 
 def _numbered(names: Sequence[str], taken: Sequence[str]) -> list[str]:

@@ -22,6 +22,7 @@ Floats = NDArray[np.float64]
 NEEDED = ("time", "pressure", "angle")
 # A step between rows is a gap when it is longer than so many usual ones, or than GAP_S; slow series may miss a sample or two.
 GAP_STEPS, GAP_S, GAP_LEAST_STEPS = 20.0, 1.0, 3.0
+BELIEVED = 1e15  # in whatever unit; squares of more do not add up
 ROUNDING = 1e-6  # of times as they are written
 
 
@@ -144,6 +145,12 @@ def _check_numbers(path: Path, values: Floats) -> None:
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
         raise BadFile(f"{path}: row {bad[0] + 2} holds no number where one is needed")
+    wild = np.argwhere(np.abs(values) > BELIEVED)
+    if len(wild):
+        row, column = wild[0].tolist()
+        raise BadFile(
+            f"{path}: row {row + 2} holds {values[row, column]:.4g}, which nothing measures; check the column, and --map"
+        )
 
 
 def _check(path: Path, series: Series) -> None:

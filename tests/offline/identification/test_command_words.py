@@ -64,8 +64,7 @@ def test_of_a_whole_log_nothing_is_said(excitation, capsys):
 
 def test_files_of_one_name_are_told_apart_by_their_folders():
     files = [Path("a/x/bend.csv"), Path("b/x/bend.csv"), Path("a/x/other.csv"), Path("a/x/bend.csv")]
-    assert labels(files, ending=False)[1:3] == ["b/x/bend", "other"]
-    assert len(set(labels(files, ending=False))) == 4
+    assert labels(files, ending=False) == ["a/x/bend", "b/x/bend", "other", "a/x/bend (2)"]
     assert labels([Path("p/fast"), Path("q/fast")], ending=True) == ["p/fast", "q/fast"]
     assert labels([Path("p/one"), Path("p/Data2")], ending=True, taken=("Data1", "Data2")) == ["one", "p/Data2"]
 

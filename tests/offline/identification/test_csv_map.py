@@ -50,6 +50,7 @@ def test_a_bad_map_is_one_clear_line(entries, fault):
         (lambda lines: [*lines[:5], "1,2", *lines[6:]], "row 6 has 2 fields where the header has 5"),
         (lambda lines: [*lines[:5], "160,a,0,1,x", *lines[6:]], "row 6 holds no number"),
         (lambda lines: [*lines[:9], lines[7], *lines[10:]], "row 10: time must rise"),
+        (lambda lines: [*lines[:5], "160,1e300,0,1,x", *lines[6:]], r"row 6 holds 1e\+300, which nothing measures"),
         (lambda lines: [*lines[:40], *[lines[39]] * 20], "39 rows"),
         (lambda lines: [*lines[:9], *lines[31:]], "row 10: a gap of 0.92 s before it, where rows are usually 0.04 s apart"),
         (lambda lines: [*lines[:60], "1e10,1,0,1,x"], r"row 61: a gap of 1e\+07 s"),
