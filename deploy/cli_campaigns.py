@@ -105,6 +105,7 @@ def evaluate(
 
 @app.command()
 def identify(
+    context: typer.Context,
     runs: Annotated[list[Path] | None, typer.Argument(metavar="RUN...", help="Logs of excitation; the first one trains.")] = None,
     csv: Annotated[
         list[Path] | None, typer.Option(metavar="FILE", help="A CSV file; the first one trains, more validate.")
@@ -135,7 +136,9 @@ def identify(
 ) -> int:
     """Identify the bending model from logs or CSV files, with intervals, and score it by free simulation."""
     from softloop.deploy import identify as identification
+    from softloop.deploy.identify_checks import check_options
 
+    check_options(_given(context))
     if venting:
         return identification.identify_vent(tuple(csv or ()), tuple(columns or ()), train, as_json=as_json)
     asked = identification.Asked(
@@ -143,6 +146,14 @@ def identify(
         interval, select, output, figure, as_json,
     )  # fmt: skip
     return identification.identify(asked)
+
+
+def _given(context: typer.Context) -> dict[str, str]:
+    """Parameters that stand on the command line -> how a person writes them."""
+    there = (p for p in context.command.params if p.name)
+    written = {p.name: p.opts[0] if p.param_type_name == "option" else (getattr(p, "metavar", None) or p.opts[0]) for p in there}
+    sources = {name: context.get_parameter_source(name) for name in written if name}
+    return {name: written[name] for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 
 
 @app.command()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import tomllib
 from collections.abc import Sequence
 from importlib import metadata
@@ -13,17 +12,18 @@ import numpy as np
 import tomlkit
 from pydantic import ValidationError
 
+from softloop.deploy.identify_files import digest_of
 from softloop.dynamics.parameters import Parameters, shipped
 from softloop.offline.identification.bounds import bounds_of
 from softloop.offline.identification.intervals import Uncertainty
 from softloop.offline.identification.output_error import Fit, score
 from softloop.offline.identification.series import Series
-from softloop.offline.identification.structure import PAPER, bare_of
+from softloop.offline.identification.structure import PAPER, Structure, bare_of
 from softloop.offline.log import Log
-from softloop.offline.run_log import find_log, open_run
+from softloop.offline.run_log import open_run
+from softloop.offline.summary import judged
 from softloop.wire.benchfile import validated
-from softloop.wire.errors import BadConfig, BadFile
-from softloop.wire.log_parts import parts_of
+from softloop.wire.errors import BadConfig, BadFile, printable
 
 
 def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty, series: Sequence[Series]) -> None:
@@ -39,8 +39,7 @@ def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty
         BadConfig: the structure is another, or the values make no usable parameter file.
         BadFile: the file cannot be written, or the values come from no log.
     """
-    if not runs or bare_of(fit.structure) != PAPER:
-        raise BadConfig("--output needs logs, orders 2,0,3 and one pressure: that is the model which the controller has")
+    check_usable(runs, fit.structure)
     log = open_run(runs[0])
     content = base_of(log)
     content |= {"name": file.stem, "bending": _bending(sure, series[0])}
@@ -53,6 +52,12 @@ def write_evidence(file: Path, runs: Sequence[Path], fit: Fit, sure: Uncertainty
         file.write_text(tomlkit.dumps(content), encoding="utf-8")
     except OSError as error:
         raise BadFile(f"{file}: cannot be written: {error.strerror or error}") from None
+
+
+def check_usable(runs: Sequence[Path], structure: Structure) -> None:
+    """Whether a fit of that structure to those logs can make a parameter file. Raises BadConfig."""
+    if not runs or bare_of(structure) != PAPER:
+        raise BadConfig("--output needs logs, orders 2,0,3 and one pressure: that is the model which the controller has")
 
 
 def rig_of(log: Log) -> str:
@@ -81,28 +86,30 @@ def _bending(sure: Uncertainty, train: Series) -> dict[str, dict[str, float]]:
 
 def _evidence(runs: Sequence[Path], log: Log, fit: Fit, sure: Uncertainty, series: Sequence[Series]) -> dict[str, Any]:
     kept = [sure.names.index(name) for name in PAPER.names]
+    # The second of `series` is the half of the first log that did not train.
+    trained = [i == 0 or (i > 1 and digest_of(path) == digest_of(runs[0])) for i, path in enumerate(runs)]
+    fits = [fit.fits[0], *(score(fit, s) for s in series[1:])]
+    rows = zip(runs, series, fits, trained, strict=True)
     return {
         "rig": rig_of(log),
         "method": f"{fit.structure}, {sure.method}",
         "softloop": metadata.version("softloop"),
         "parameters": list(PAPER.names),
         "covariance": sure.covariance[np.ix_(kept, kept)].tolist(),
-        "runs": [_run(path, fit, s, trained=i == 0) for i, (path, s) in enumerate(zip(runs, series, strict=True))],
+        "runs": [_run(path, s, percent, trained=t) for path, s, percent, t in rows],
     }
 
 
-def sha256_of(run: Path) -> str:
-    """Of a run's log, all its parts in their order."""
-    return hashlib.sha256(b"".join(part.read_bytes() for part in parts_of(find_log(run)))).hexdigest()
-
-
-def _run(path: Path, fit: Fit, series: Series, *, trained: bool) -> dict[str, Any]:
+def _run(path: Path, series: Series, fit_percent: float, *, trained: bool) -> dict[str, Any]:
     counted = series.time_s[series.counted]
+    damage, against = judged(open_run(path))
     return {
         "name": series.name,
-        "sha256": sha256_of(path),
+        "sha256": digest_of(path),
         "start_s": float(counted[0]),
         "end_s": float(counted[-1]),
-        "fit_percent": fit.fits[0] if trained else score(fit, series),
+        "fit_percent": fit_percent,
         "trained": trained,
+        "log_problems": [printable(text) for text in damage],
+        "evidence_problems": [printable(text) for text in against],
     }

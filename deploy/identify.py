@@ -5,29 +5,34 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 
 from softloop.deploy.destination import check_destination
-from softloop.deploy.evidence import write_evidence
+from softloop.deploy.evidence import check_usable, write_evidence
+from softloop.deploy.identify_files import Data, of_runs, of_tables, of_vents
+from softloop.deploy.identify_words import say
 from softloop.deploy.progress import counted_progress
 from softloop.dynamics.parameters import load_parameters, shipped
-from softloop.offline.identification.csv_map import parse_map, read_columns, read_csv, read_vent
-from softloop.offline.identification.experiments import halves
+from softloop.offline.identification.csv_map import parse_map, read_columns
 from softloop.offline.identification.fitting import fit_output_error
 from softloop.offline.identification.intervals import Uncertainty, of_fit, of_regression
 from softloop.offline.identification.orders import compare
 from softloop.offline.identification.output_error import Fit, score
+from softloop.offline.identification.plausible import fit_hints, unit_hints
 from softloop.offline.identification.regression import as_fit, instrumental_variables, least_squares
-from softloop.offline.identification.series import Series, from_log
+from softloop.offline.identification.series import Series
 from softloop.offline.identification.structure import PAPER, Structure, bare_of
 from softloop.offline.identification.valve_flow import NAMES as VALVE_NAMES
 from softloop.offline.identification.valve_flow import FlowTests, fit_valve
 from softloop.offline.identification.venting import fit_vent, score_vent
-from softloop.offline.run_log import open_run
 from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig
+
+WIDEST = 10_000  # columns; no table is
 
 
 @dataclass(frozen=True)
@@ -59,25 +64,34 @@ class Answer:
     uncertainty: Uncertainty
     train: Series
     scores: dict[str, float]
+    seen: frozenset[str]  # names of those in `scores` that are the training data again
+    fit_s: float  # how long the fit took, with its intervals
+    hints: tuple[str, ...]
 
 
 def identify(asked: Asked) -> int:
     """Do what was asked and say it. Raises BadFile or BadConfig."""
-    for option, file in (("--output", asked.output), ("--figure", asked.figure)):
-        if file is not None:
-            check_destination(file, option)
-    train, validate = _data(asked)
+    _check_files(asked)
+    data = _data(asked)
+    train, validate = data.train, data.validate
     structure = _structure(asked, train.pressure_kpa.shape[1])
+    if asked.output:
+        check_usable(asked.runs, structure)
+    hints = _said(unit_hints([train, *validate]))  # before the fit, which wrong units may make long
     if asked.select:
-        return _select(structure, train, validate, as_json=asked.as_json)
+        return _select(structure, data, as_json=asked.as_json)
+    begun_s = monotonic()
     fit, uncertainty = fitted(structure, train, asked.method, asked.interval)
-    answer = Answer(fit, uncertainty, train, {v.name: score(fit, v) for v in validate})
+    fit_s = monotonic() - begun_s
+    hints += _said(fit_hints({train.name: fit.fits[0]}))
+    answer = Answer(fit, uncertainty, train, {v.name: score(fit, v) for v in validate}, data.seen, fit_s, tuple(hints))
     if asked.output:
         write_evidence(asked.output, asked.runs, fit, uncertainty, [train, *validate])
     if asked.figure:
         from softloop.offline.identification.figures import validation  # noqa: PLC0415 - matplotlib only where it draws
+        from softloop.offline.vector import save  # noqa: PLC0415
 
-        validation(fit, [train, *validate]).savefig(asked.figure)
+        save(validation(fit, [train, *validate]), asked.figure)
     if asked.as_json:
         print(json.dumps(as_dict(answer), indent=2))
     else:
@@ -89,15 +103,17 @@ def identify_vent(files: tuple[Path, ...], columns: tuple[str, ...], trained: in
     """Fit the flow law to the ventings of the first `trained` files, score it on the others, and say it."""
     if not 1 <= trained <= len(files):
         raise BadConfig(f"--train {trained}: must be 1 to {len(files)}, the number of files")
-    mapped = parse_map(columns, ("time", "pressure"), ("input",))
-    runs = [read_vent(path, mapped) for path in files]
-    found = fit_vent(runs[:trained])
+    data = of_vents(files, parse_map(columns, ("time", "pressure"), ("input",)), trained)
+    begun_s = monotonic()
+    found = fit_vent(data.train)
+    fit_s = monotonic() - begun_s
     sure, (low, high) = found.uncertainty, found.uncertainty.interval()
-    own = dict(zip((r.name for r in runs), found.fits, strict=False))
-    scores = {r.name: score_vent(sure.values, r) for r in runs[trained:]}
+    own = {r.name: fit for r, fit in zip(data.train, found.fits, strict=True)}
+    scores = {r.name: score_vent(sure.values, r) for r in data.validate}
     if as_json:
         rows = {n: {"value": v, "low": a, "high": b} for n, v, a, b in zip(sure.names, sure.values, low, high, strict=True)}
-        print(json.dumps({"parameters": rows, "train": own, "validate": scores, "rank": found.rank}, indent=2))
+        answer = {"parameters": rows, "train": own, "validate": scores, "trained_on": sorted(data.seen), "rank": found.rank}
+        print(json.dumps({**answer, "fit_s": fit_s}, indent=2))
         return EXIT_OK
     for name, value, a, b in zip(sure.names, sure.values, low, high, strict=True):
         print(f"{name} {value:.4g} (95 %: {a:.4g} to {b:.4g})")
@@ -105,7 +121,8 @@ def identify_vent(files: tuple[Path, ...], columns: tuple[str, ...], trained: in
     for name, fit in own.items():
         print(f"  {name} (trained) {fit:.2f} %")
     for name, fit in scores.items():
-        print(f"  {name} (unseen) {fit:.2f} %")
+        print(f"  {name} ({_seen(name, data.seen)}) {fit:.2f} %")
+    print(_took(fit_s))
     return EXIT_OK
 
 
@@ -146,17 +163,30 @@ def fitted(structure: Structure, train: Series, method: str, interval: str) -> t
     return as_fit(found, train), of_regression(found, interval)
 
 
-def _data(asked: Asked) -> tuple[Series, list[Series]]:
+def _data(asked: Asked) -> Data:
     """Training data, and the rest. Of logs, the first run's halves are Data1 and Data2; of CSV files, the first one trains."""
     if bool(asked.runs) == bool(asked.csv):
         raise BadConfig("identify needs either runs, or --csv FILE with --map, and not both")
     if asked.csv:
-        columns = parse_map(asked.columns)
-        series = [read_csv(path, columns) for path in asked.csv]
-        return series[0], series[1:]
-    series = [from_log(open_run(run), run.name) for run in asked.runs]
-    first, second = halves(series[0])
-    return first, [second, *series[1:]]
+        return of_tables(asked.csv, parse_map(asked.columns))
+    return of_runs(asked.runs)
+
+
+def _said(hints: list[str]) -> list[str]:
+    for hint in hints:
+        say(hint)
+    return hints
+
+
+def _check_files(asked: Asked) -> None:
+    """Whether what is to be written can be, before a long fit. Raises BadFile or BadConfig."""
+    for option, target in (("--output", asked.output), ("--figure", asked.figure)):
+        if target is not None:
+            check_destination(target, option)
+    if asked.figure:
+        from softloop.offline.vector import format_of  # noqa: PLC0415 - matplotlib only where it draws
+
+        format_of(asked.figure)
 
 
 def _structure(asked: Asked, inputs: int) -> Structure:
@@ -180,11 +210,14 @@ def as_dict(answer: Answer) -> dict[str, Any]:
         "parameters": {n: {"value": v, "error": e, "low": a, "high": b} for n, v, e, a, b in rows},
         "train": {answer.train.name: answer.fit.fits[0]},
         "validate": answer.scores,
+        "trained_on": sorted(answer.seen),
+        "fit_s": answer.fit_s,
+        "hints": list(answer.hints),
     }
 
 
 def _show(answer: Answer) -> None:
-    console, sure = Console(highlight=False), answer.uncertainty
+    sure = answer.uncertainty
     low, high = sure.interval()
     paper = _table1() if answer.fit.structure.inputs == 1 else {}
     shown = paper if set(PAPER.names) <= set(sure.names) else {}
@@ -194,10 +227,26 @@ def _show(answer: Answer) -> None:
     for i, name in enumerate(sure.names):
         beside = [shown.get(name, ("", ""))[0], shown.get(name, ("", ""))[1]] if shown else []
         table.add_row(name, f"{sure.values[i]:.5g}", f"{low[i]:.5g}", f"{high[i]:.5g}", *beside)
-    console.print(table)
+    _print_whole(table)
     print(f"fit by free simulation, NRMSE: {answer.train.name} (trained) {answer.fit.fits[0]:.2f} %")
     for name, fit in answer.scores.items():
-        print(f"  {name} (unseen) {fit:.2f} %")
+        print(f"  {name} ({_seen(name, answer.seen)}) {fit:.2f} %")
+    print(_took(answer.fit_s))
+
+
+def _took(fit_s: float) -> str:
+    return f"fitted in {fit_s:.1f} s"
+
+
+def _print_whole(table: Table) -> None:
+    """A table as wide as it is: cut off at a narrow terminal's or a pipe's edge, it would lose digits."""
+    console = Console(highlight=False)
+    needed = Measurement.get(console, console.options.update(max_width=WIDEST), table).maximum
+    Console(highlight=False, width=max(console.width, needed)).print(table)
+
+
+def _seen(name: str, seen: frozenset[str]) -> str:
+    return "trained on" if name in seen else "unseen"
 
 
 def _table1() -> dict[str, tuple[str, str]]:
@@ -206,19 +255,22 @@ def _table1() -> dict[str, tuple[str, str]]:
     return {name: (f"{e.value:.5g}", f"{e.min:.5g} to {e.max:.5g}") for name, e in entries.items()}
 
 
-def _select(structure: Structure, train: Series, validate: list[Series], *, as_json: bool) -> int:
+def _select(structure: Structure, data: Data, *, as_json: bool) -> int:
+    begun_s = monotonic()
     with counted_progress("fitting structures", quiet=as_json) as progress:
-        choices = compare(structure, train, validate, progress)
+        choices = compare(structure, data.train, data.validate, progress)
     if as_json:
         print(json.dumps([asdict(c) for c in choices], indent=2))
         return EXIT_OK
-    table = Table(title=f"orders, trained on {train.name}; fit by free simulation in %")
-    for heading in ("m, n, r", "values", train.name, *(v.name for v in validate), "Schwarz", "interval holds 0"):
+    table = Table(title=f"orders, trained on {data.train.name}; fit by free simulation in %")
+    others = [v.name + " (trained on)" * (v.name in data.seen) for v in data.validate]
+    for heading in ("m, n, r", "values", data.train.name, *others, "Schwarz", "interval holds 0"):
         table.add_column(heading, justify="right")
     best = min(choices, key=lambda c: c.schwarz)
     for c in choices:
         s, mark = c.structure, " *" if c is best else ""
         fits = [f"{f:.2f}" for f in (c.fit, *c.validation)]
         table.add_row(f"{s.m}, {s.n}, {s.r}", str(len(s.names)), *fits, f"{c.schwarz:.4f}{mark}", " ".join(c.uncertain) or "-")
-    Console(highlight=False).print(table)
+    _print_whole(table)
+    print(_took(monotonic() - begun_s))
     return EXIT_OK

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.linalg import block_diag
 
-from softloop.deploy.evidence import base_of, rig_of, sha256_of
+from softloop.deploy.evidence import base_of, rig_of
+from softloop.deploy.identify_files import digest_of
 from softloop.dynamics.parameters import Parameters
 from softloop.offline.identification.bounds import BOUND_ERRORS
 from softloop.offline.identification.intervals import Uncertainty
@@ -170,7 +171,7 @@ def _run(runs: TankRuns, place: int) -> dict[str, Any]:
     fitted = [modelled(runs.fits[v].values, tests[v], runs.discharge, runs.volume.temperature_k) for v in VALVES]
     return {
         "name": log.path.parent.name,
-        "sha256": sha256_of(log.path),
+        "sha256": digest_of(log.path),
         "start_s": start_s,
         "end_s": end_s,
         "fit_percent": nrmse_fit(measured, np.concatenate(fitted)),

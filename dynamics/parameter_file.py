@@ -70,6 +70,8 @@ class EvidenceRun(Table):
     end_s: float
     fit_percent: float = Field(description="NRMSE fit of a free simulation; of flow tests, of their flow")
     trained: bool
+    log_problems: tuple[str, ...] = Field((), description="what is damaged or missing in the log file")
+    evidence_problems: tuple[str, ...] = Field((), description="what speaks against the run as evidence; empty: nothing")
 
 
 class Evidence(Table):

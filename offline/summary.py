@@ -125,6 +125,15 @@ def evidence_problems(found: dict[str, Any]) -> list[str]:
     return [text for bad, text in checks if bad]
 
 
+def judged(log: Log) -> tuple[list[str], list[str]]:
+    """What is wrong with a log's file, and what speaks against using its run as evidence; one line each."""
+    try:
+        against = evidence_problems(_course(log) | _losses(log) | _plant(log) | _clocks(log))
+    except (KeyError, ValueError):  # a field that softloop has and the log's own definition has not
+        against = ["its messages are of another definition, so that it cannot be judged"]
+    return _problems(log), against
+
+
 def _problems(log: Log) -> list[str]:
     if log.problems or log.finished:
         return log.problems

@@ -31,11 +31,16 @@ def as_bytes(figure: Figure, ending: str) -> bytes:
 
 def save(figure: Figure, target: Path) -> Path:
     """Write a figure in the format of the file's ending. Raises BadConfig on another ending, and as `write` does."""
+    write(target, as_bytes(figure, format_of(target)))
+    return target
+
+
+def format_of(target: Path) -> str:
+    """One of `FORMATS`, as the file's ending says. Raises BadConfig on another ending."""
     ending = target.suffix.removeprefix(".").lower()
     if ending not in FORMATS:
         raise BadConfig(f"{target}: the ending says the format, one of: {', '.join('.' + f for f in FORMATS)}")
-    write(target, as_bytes(figure, ending))
-    return target
+    return ending
 
 
 def write(target: Path, data: bytes) -> None:

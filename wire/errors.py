@@ -10,17 +10,18 @@ EXIT_LOST = 4  # a process or a wire was lost while running
 EXIT_INTERRUPTED = 130
 
 
-class SoftloopError(Exception):
-    """Base of all errors meant for a person: `str(error)` is the one line to show.
+def printable(said: str) -> str:
+    """The text as one line, whatever it quotes: a line's end, a bell, half a character are shown as they are written."""
+    return said if said.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in said)
 
-    What it quotes of a file or a payload may hold a line's end, a bell, half a character: these are shown as they are written.
-    """
+
+class SoftloopError(Exception):
+    """Base of all errors meant for a person: `str(error)` is the one line to show, `printable`."""
 
     exit_code = EXIT_USAGE
 
     def __str__(self) -> str:
-        said = super().__str__()
-        return said if said.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in said)
+        return printable(super().__str__())
 
 
 class BadFile(SoftloopError):

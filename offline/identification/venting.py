@@ -87,6 +87,8 @@ def empty(p: Floats, time_s: Floats, first_kpa: float, out: Floats) -> None:
 
 def vent_of(name: str, time_s: Floats, pressure_kpa: Floats, inflow: Floats | None = None) -> Vent:
     """The last part of a record, from where `inflow` (n,) has become 0 for good, or from the pressure's peak. Raises BadFile."""
+    if len(time_s) < LEAST_SAMPLES:
+        raise BadFile(f"{name}: {len(time_s)} samples; {LEAST_SAMPLES} or more of venting are needed")
     flowing = pressure_kpa >= _TOP * pressure_kpa.max() if inflow is None else inflow != 0.0
     driven = np.flatnonzero(flowing)
     begin = int(driven[-1]) + 1 if len(driven) else 0
