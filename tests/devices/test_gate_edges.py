@@ -186,8 +186,8 @@ def test_a_requester_of_number_0_is_one_as_any_other():
 
 
 def test_the_config_is_the_bench_files_numbers_to_the_nanosecond():
-    config = GateBench(driver_silence_ms=37.0, vent_settle_s=0.25, vent_time_s=3.0, hold_ticks=2).config
-    assert (config.driver_silence_ns, config.vent_settle_ns, config.vent_time_ns) == (37 * MS, 250 * MS, 3000 * MS)
+    config = GateBench(driver_silence_ms=37.0, vent_settle_s=0.75, vent_time_s=3.0, hold_ticks=2).config
+    assert (config.driver_silence_ns, config.vent_settle_ns, config.vent_time_ns) == (37 * MS, 750 * MS, 3000 * MS)
     assert config.silence_ns == 3 * PERIOD_NS
 
 
