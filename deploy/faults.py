@@ -11,13 +11,13 @@ from pathlib import Path
 from time import gmtime, strftime
 from typing import TYPE_CHECKING, Any
 
-from softloop.deploy.bench import Bench, load_bench
+from softloop.deploy.bench import Bench
 from softloop.deploy.conclude import conclude
 from softloop.deploy.launcher import Options, Outcome, launch
 from softloop.deploy.progress import counted_progress
 from softloop.deploy.rig_state import event_line
 from softloop.deploy.scenario import Scenario, bench_of, find_scenario, load_scenario, shipped_scenarios, write_bench
-from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_NEGATIVE, EXIT_OK, BadFile, Interrupted, SoftloopError, Unavailable
+from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_NEGATIVE, EXIT_OK, BadFile, Interrupted, Unavailable
 
 if TYPE_CHECKING:
     from softloop.offline.log import Log
@@ -148,19 +148,7 @@ def _launched(
     with tempfile.TemporaryDirectory(prefix="softloop-faults-") as folder:
         written = Path(folder) / f"{file.stem}.bench.toml"
         write_bench(scenario, file, bench_file, written, changes)
-        _check(written, file)
         return launch(written, options, then)
-
-
-def _check(written: Path, file: Path) -> None:
-    """That the bench can be run; what is wrong with it is said of the scenario's own file, not of one that is soon gone."""
-    try:
-        load_bench(written)
-    except SoftloopError as error:
-        said = (
-            str(error).replace(f"{written}: key 'faults.injections", f"{file}: key 'injections").replace(str(written), str(file))
-        )
-        raise type(error)(said) from None
 
 
 def _keep(folder: Path, results: list[Result]) -> None:

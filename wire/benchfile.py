@@ -44,14 +44,7 @@ def load_model(model: type[T], content: dict[str, Any], path: Path | str) -> T:
     try:
         return validated(model, content)
     except ValidationError as error:
-        raise BadConfig(f"{path}: {'; '.join(_say(model, e) for e in _own_errors(error)[:3])}") from None
-
-
-def _own_errors(error: ValidationError) -> list[Any]:
-    """Without the complaint that a list is too short for what is wrong with its items, which are left out of it then."""
-    found = error.errors()
-    inside = {e["loc"][:depth] for e in found for depth in range(len(e["loc"]))}
-    return [e for e in found if not (e["type"] == "too_short" and e["loc"] in inside)]
+        raise BadConfig(f"{path}: {'; '.join(_say(model, e) for e in error.errors()[:3])}") from None
 
 
 def validated(model: type[T], content: dict[str, Any]) -> T:

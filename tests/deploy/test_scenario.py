@@ -76,10 +76,6 @@ def test_by_the_clock_faults_of_the_rig_count_from_arming(bench):
     ('kind = "power_loss"', 'kind = "power_loss"\nsize = 2.0', "kind 'power_loss' has no size"),
     ('kind = "power_loss"', 'kind = "power_loss"\ntarget = "plant"', "has neither target nor probability"),
     ("duration_s = 3.0", "", "key 'duration_s' is missing"),
-    ("at_s = 2.0", "at_s = 3.0", "key 'injections': at_s 3 of 'power_loss' is after the end: the rig is armed for 3 s"),
-    ('kind = "power_loss"', 'kind = "can_corrupt"\ntarget = "analog"\nsize = 65.0', "a whole number of bits, at most 64, got 65"),
-    ('kind = "power_loss"', 'kind = "can_corrupt"\ntarget = "analog"\nsize = 1.5', "a whole number of bits, at most 64, got 1.5"),
-    ('kind = "power_loss"', 'kind = "can_delay"\ntarget = "analog"\nsize = 1e18', "less than or equal to 1000000"),
     ("settle_s = 0.4", "settle = 0.4", "unknown key 'run.settle'"),
     ('kind = "power_loss"', 'kind = "process_kill"\ntarget = "valves"', "kind 'process_kill' needs wall pace"),
     ('kind = "power_loss"', 'kind = "clock_step"\ntarget = "valves"\nsize = 5.0', "kind 'clock_step' needs wall pace"),
@@ -92,7 +88,6 @@ def test_a_mistake_is_one_line_that_names_file_and_key(bench, tmp_path, old, new
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
     assert str(tmp_path) in str(caught.value)
-    assert "should have at least" not in str(caught.value), "the list is not too short: its items are wrong"
 
 
 def test_what_breaks_the_simulated_rig_is_refused_where_there_is_none(bench):
