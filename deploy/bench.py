@@ -109,8 +109,8 @@ def read_source(path: Path, run_dir: Path | None = None) -> Source:
             _remove(content, origins, name, file)
         own.pop("base", None)
         for piece, keys in _pieces_of(file, own.pop("pieces", [])):
-            _merge(content, origins, _substituted(keys, piece, run_dir), piece, ())
-        _merge(content, origins, _substituted(own, file, run_dir), file, ())
+            _merge(content, origins, substituted(keys, piece, run_dir), piece, ())
+        _merge(content, origins, substituted(own, file, run_dir), file, ())
     return Source(path, content, origins, run_dir)
 
 
@@ -143,7 +143,7 @@ def validate(source: Source) -> Bench:
     if source.run_dir is None:
         return bench
     # Default values may name the run directory too.
-    return Bench.model_validate(_substituted(bench.model_dump(), source.file, source.run_dir))
+    return Bench.model_validate(substituted(bench.model_dump(), source.file, source.run_dir))
 
 
 def process_config(bench: Bench, name: str) -> Any:
@@ -208,17 +208,22 @@ def _check_buses(bench: Bench, source: Source) -> None:
             "that the simulated rig holds cannot carry them; leave out [can.NAME.emulation]"
         )
     names = (getattr(bench.plant, "can_analog", ""), getattr(bench.plant, "can_valves", ""))
-    for injection in bench.faults.injections:
+    for place, injection in enumerate(bench.faults.injections):
         if injection.family == "bus" and names[injection.target != "analog"] not in emulated:
-            raise BadConfig(f"{source.file}: key 'faults.injections': kind '{injection.kind}' needs a [can.NAME.emulation]")
+            raise BadConfig(f"{_of_injection(source, place)}: kind '{injection.kind}' needs a [can.NAME.emulation]")
+
+
+def _of_injection(source: Source, place: int) -> str:
+    """How an error begins that is about one of the bench's injections."""
+    return f"{source.origin(('faults', 'injections'))}: key 'faults.injections.{place}'"
 
 
 def _check_router(bench: Bench, source: Source) -> None:
     """A meeting point that is to be lost is neither the launcher nor another host's affair. Raises BadConfig."""
-    lost = any(injection.family == "router" for injection in bench.faults.injections)
-    if lost and (not bench.run.shared_router or bench.hosts):
+    lost = next((place for place, injection in enumerate(bench.faults.injections) if injection.family == "router"), None)
+    if lost is not None and (not bench.run.shared_router or bench.hosts):
         raise BadConfig(
-            f"{source.file}: key 'faults.injections': kind 'router_loss' needs [run] shared_router = true, on one host; the run "
+            f"{_of_injection(source, lost)}: kind 'router_loss' needs [run] shared_router = true, on one host; the run "
             "then starts its router itself"
         )
 
@@ -238,9 +243,9 @@ def check_lockstep(bench: Bench, file: Path, pace: str = "lockstep", asked: str 
         raise BadConfig(f"{file}: key 'valves.driver': must be \"rig\" at {pace} pace, as the simulated driver is one")
     if bench.plant.faults_from != "start":
         raise BadConfig(f"{file}: key 'plant.faults_from': must be \"start\" at {pace} pace, where arming is planned")
-    late = next((i.kind for i in bench.faults.injections if i.needs_wall), None)
-    if late is not None:
-        raise BadConfig(f"{file}: key 'faults.injections': kind '{late}' needs wall pace")
+    for place, injection in enumerate(bench.faults.injections):
+        if injection.needs_wall:
+            raise BadConfig(f"{file}: key 'faults.injections.{place}': kind '{injection.kind}' needs wall pace")
     talking = next((name for name, bus in bench.can.items() if bus.emulation is not None and bus.emulation.bus_errors), None)
     if talking is not None:
         raise BadConfig(f"{file}: key 'can.{talking}.emulation.bus_errors': must be false at {pace} pace")
@@ -323,11 +328,12 @@ def _merge(content: dict[str, Any], origins: dict[Key, Path], own: dict[str, Any
             content[key] = value
 
 
-def _substituted(value: Any, file: Path, run_dir: Path | None) -> Any:
+def substituted(value: Any, file: Path, run_dir: Path | None) -> Any:
+    """A copy of what stands in `file` with `{bench_dir}` filled in, and with a run's directory what follows from that."""
     if isinstance(value, dict):
-        return {key: _substituted(inner, file, run_dir) for key, inner in value.items()}
+        return {key: substituted(inner, file, run_dir) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_substituted(inner, file, run_dir) for inner in value]
+        return [substituted(inner, file, run_dir) for inner in value]
     if not isinstance(value, str):
         return value
     value = value.replace("{bench_dir}", str(file.parent.resolve()))

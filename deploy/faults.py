@@ -16,7 +16,7 @@ from softloop.deploy.conclude import conclude
 from softloop.deploy.launcher import Options, Outcome, launch
 from softloop.deploy.progress import counted_progress
 from softloop.deploy.rig_state import event_line
-from softloop.deploy.scenario import Scenario, bench_of, find_scenario, load_scenario, shipped_scenarios, write_bench
+from softloop.deploy.scenario import Scenario, bench_of, find_scenario, load_scenario, make_bench, shipped_scenarios, write_bench
 from softloop.wire.errors import EXIT_INTERRUPTED, EXIT_NEGATIVE, EXIT_OK, BadFile, Interrupted, Unavailable
 
 if TYPE_CHECKING:
@@ -61,8 +61,8 @@ def run_with_faults(bench_file: Path, scenario_file: Path, options: Options) -> 
     """
     file = find_scenario(scenario_file)
     scenario = load_scenario(file)
-    if options.pace is not None:
-        scenario = scenario.model_copy(update={"pace": options.pace})
+    asked = {"pace": options.pace, "duration_s": options.duration_s}
+    scenario = scenario.model_copy(update={key: value for key, value in asked.items() if value is not None})
 
     def then(bench: Bench, run_dir: Path, outcome: Outcome, *, quiet: bool) -> int:
         code = conclude(bench, run_dir, outcome.code, outcome.text, began=outcome.began, quiet=quiet)
@@ -86,6 +86,8 @@ def run_all(only: list[Path], out: Path | None, *, as_json: bool) -> int:
     """
     files = [find_scenario(path) for path in only] or list(shipped_scenarios().values())
     scenarios = [(file, load_scenario(file)) for file in files]
+    for file, scenario in scenarios:  # a mistake in the last one is said before the first one runs
+        make_bench(scenario, file, bench_of(scenario, file))
     folder = out or Path("runs") / f"faults-{strftime('%Y%m%dT%H%M%SZ', gmtime())}"
     results: list[Result] = []
     with counted_progress("scenarios", quiet=as_json) as progress:

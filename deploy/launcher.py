@@ -15,6 +15,7 @@ from softloop.deploy.bench import Bench, folders_of, load_bench
 from softloop.deploy.beside import beside, onlookers
 from softloop.deploy.children import Child, Children
 from softloop.deploy.conclude import conclude
+from softloop.deploy.fault_times import check_times
 from softloop.deploy.fleet import READY, RUNNING, STOPPING, Alone, Fleet
 from softloop.deploy.gate_requests import Requests, ask
 from softloop.deploy.hosts import choose_host, digest, share_of
@@ -79,6 +80,7 @@ def launch(bench_file: Path, options: Options, then: Callable[..., int] = _concl
             be made.
     """
     bench = _with_options(load_bench(bench_file), options)
+    check_times(bench, bench_file)
     host, same = choose_host(bench, options.host), digest(bench, folders_of(bench_file))
     if not processes_of(bench):
         raise BadConfig(f"{bench_file}: no process to run: it has none of the tables plant, valves, controller, ...")

@@ -9,7 +9,9 @@ from typing import Any, Literal, get_args
 import tomlkit
 from pydantic import Field, ValidationError, model_validator
 
-from softloop.deploy.bench import Bench, find_bench, read_source
+from softloop.deploy.bench import Bench, Source, find_bench, read_source, substituted, validate
+from softloop.deploy.fault_times import check_times
+from softloop.deploy.scenario_keys import Places, ScenarioKeys, places_of
 from softloop.plant.config import FaultConfig
 from softloop.wire.benchfile import Table, load_model, read_toml
 from softloop.wire.errors import BadConfig, BadFile
@@ -18,6 +20,8 @@ from softloop.wire.fault_config import InjectionConfig, InjectionFields, Kind
 PLANT_KINDS: tuple[str, ...] = get_args(FaultConfig.model_fields["kind"].annotation)
 HOST_KINDS: tuple[str, ...] = get_args(Kind)
 NAME = r"^[a-z0-9_-]{1,40}$"
+# Key of the bench -> the scenario's own.
+_OWN_KEYS = {"pace.mode": "pace", "run.duration_s": "duration_s", "faults.seed": "seed"}
 
 
 class ScenarioInjection(InjectionFields):
@@ -35,7 +39,7 @@ class ScenarioInjection(InjectionFields):
         if self.in_plant and (self.target or self.probability != 1.0):
             raise ValueError(f"kind '{self.kind}' breaks the simulated rig and has neither target nor probability")
         try:
-            self.plant_fault(0.0) if self.in_plant else self.injection()
+            FaultConfig.model_validate(self.plant_fault(0.0)) if self.in_plant else self.injection()
         except ValidationError as error:
             raise ValueError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
         return self
@@ -43,8 +47,7 @@ class ScenarioInjection(InjectionFields):
     def plant_fault(self, armed_s: float) -> dict[str, Any]:
         """The `[[plant.faults]]` for a gate that is armed `armed_s` after what the plant counts from."""
         on_s = armed_s + self.at_s
-        fault = {"kind": self.kind, "on_s": on_s, "off_s": on_s + self.duration_s, "size": self.size}
-        return FaultConfig.model_validate(fault).model_dump()
+        return {"kind": self.kind, "on_s": on_s, "off_s": on_s + self.duration_s, "size": self.size}
 
     def injection(self) -> dict[str, Any]:
         """The `[[faults.injections]]`."""
@@ -88,48 +91,70 @@ def load_scenario(path: Path) -> Scenario:
 
 def bench_of(scenario: Scenario, path: Path) -> Path:
     """The bench file that a scenario names: beside it, or a shipped one. Raises BadFile."""
-    beside = path.parent / scenario.bench
-    return beside if beside.is_file() else find_bench(Path(scenario.bench))
+    try:
+        beside = path.parent / scenario.bench
+        return beside if beside.is_file() else find_bench(Path(scenario.bench))
+    except BadFile as error:
+        raise BadFile(f"{path}: key 'bench': {error}") from None
+    except OSError as error:  # such as a name that is longer than any file's
+        raise BadFile(f"{path}: key 'bench': cannot be looked for: {error.strerror or error}") from None
 
 
 def write_bench(scenario: Scenario, path: Path, bench_file: Path, file: Path, changes: dict[str, Any] | None = None) -> None:
-    """Write the bench of a scenario to `file`: that of `bench_file`, the scenario's overrides and injections put in.
+    """Write the bench of a scenario, as `make_bench` makes it, to `file`. Raises BadFile, BadConfig: one line."""
+    file.write_text(tomlkit.dumps(make_bench(scenario, path, bench_file, changes)), encoding="utf-8")
+
+
+def make_bench(scenario: Scenario, path: Path, bench_file: Path, changes: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The content of a scenario's bench: that of `bench_file`, the scenario's overrides and injections put in.
 
     Args:
         path: the scenario's file, to name in errors.
         changes: more tables, put over all others.
 
     Raises:
-        BadFile, BadConfig: one line.
+        BadFile, BadConfig: one line, which names a key of the scenario's file where that is wrong.
     """
-    content = read_source(bench_file).content
-    for over in (scenario.overrides, _own_tables(scenario), changes or {}):
+    content, keys = read_source(bench_file).content, ScenarioKeys(path, bench_file, scenario.overrides)
+    _put_over(content, substituted(scenario.overrides, path, None))
+    with keys.named():
+        bench = load_model(Bench, content, path)
+    for over in (_own_tables(scenario), changes or {}):
         _put_over(content, over)
-    bench = load_model(Bench, content, path)
-    _inject(scenario, path, bench, content)
-    load_model(Bench, content, path)
-    file.write_text(tomlkit.dumps(content), encoding="utf-8")
+    keys.places |= {**_OWN_KEYS, **_inject(scenario, path, bench, content)}
+    with keys.named():
+        check_times(validate(Source(path, content)), path)
+    return content
 
 
 def _own_tables(scenario: Scenario) -> dict[str, Any]:
     return {"pace": {"mode": scenario.pace}, "run": {"duration_s": scenario.duration_s}}
 
 
-def _inject(scenario: Scenario, path: Path, bench: Bench, content: dict[str, Any]) -> None:
-    """Put the injections where the plant, the other processes and the launcher find theirs."""
-    host = [one.injection() for one in scenario.injections if not one.in_plant]
+def _inject(scenario: Scenario, path: Path, bench: Bench, content: dict[str, Any]) -> Places:
+    """Put the injections where the plant, the other processes and the launcher find theirs; gives where that is."""
+    host = {place: one.injection() for place, one in enumerate(scenario.injections) if not one.in_plant}
     before = [one.model_dump() for one in bench.faults.injections]
-    content["faults"] = {"seed": scenario.seed, "injections": before + host}
-    exact = bench.pace.mode == "lockstep"
-    plant = [one.plant_fault(bench.run.settle_s if exact else 0.0) for one in scenario.injections if one.in_plant]
+    content["faults"] = {"seed": scenario.seed, "injections": [*before, *host.values()]}
+    places = places_of("faults.injections", len(before), host)
+    exact = scenario.pace == "lockstep"
+    armed_s = bench.run.settle_s if exact else 0.0
+    plant = {place: one.plant_fault(armed_s) for place, one in enumerate(scenario.injections) if one.in_plant}
     if not plant:
-        return
-    if bench.plant is None:
-        raise BadConfig(f"{path}: key 'injections': '{plant[0]['kind']}' breaks the simulated rig, and this bench has none")
-    if bench.plant.faults and not exact:
-        raise BadConfig(f"{path}: key 'injections': this bench has [[plant.faults]] of its own, whose times count from elsewhere")
-    content["plant"]["faults"] = [one.model_dump() for one in bench.plant.faults] + plant
+        return places
+    own = _faults_of(bench, exact, f"{path}: key 'injections.{min(plant)}'", plant[min(plant)]["kind"])
+    content["plant"]["faults"] = [*own, *plant.values()]
     content["plant"]["faults_from"] = "start" if exact else "armed"
+    return places | places_of("plant.faults", len(own), plant)
+
+
+def _faults_of(bench: Bench, exact: bool, key: str, kind: str) -> list[dict[str, Any]]:
+    """What the bench's own plant breaks. Raises BadConfig where none can be added to it."""
+    if bench.plant is None:
+        raise BadConfig(f"{key}: '{kind}' breaks the simulated rig, and this bench has none")
+    if bench.plant.faults and not exact:
+        raise BadConfig(f"{key}: this bench has [[plant.faults]] of its own, whose times count from elsewhere")
+    return [one.model_dump() for one in bench.plant.faults]
 
 
 def _put_over(content: dict[str, Any], over: dict[str, Any]) -> None:

@@ -15,6 +15,12 @@ from softloop.wire.errors import BadConfig
 
 LEAST_TANK_ML = 100.0
 SUPPLY_KPA = (20.0, 240.0)  # a regulated supply is set above the first and to no more than the second, gauge
+# Kind of fault -> the least and the largest size: kPa and deg/s far above what the rig has, from any angle to any other, noise in
+# which no signal is left, a hole wider than any hose. Beyond that nothing more breaks, so it is a typo.
+FAULT_SIZES = {
+    "chamber_bias": (-1000, 1000), "angle_bias": (-360, 360), "rate_bias": (-1000, 1000), "noise": (0, 1000),
+    "supply_loss": (0, 1), "hose_burst": (0, 100), "charge_leak": (0, 100),
+}  # fmt: skip
 
 
 class SensorConfig(Table):
@@ -55,21 +61,19 @@ class FaultConfig(Table):
         "noise", "commands_lost", "driver_silent", "supply_loss", "hose_burst", "charge_stuck", "exhaust_stuck", "power_loss",
         "charge_leak",
     ] = Field(description="what breaks; see docs/exactness.md")  # fmt: skip
-    on_s: float = Field(ge=0, description="when it breaks")
-    off_s: float = Field(1e9, gt=0, description="default: it stays broken")
+    on_s: float = Field(ge=0, le=1e9, description="when it breaks")
+    off_s: float = Field(1e9, gt=0, le=2e9, description="default: it stays broken")
     size: float = Field(0.0, description="bias: kPa, deg, deg/s; noise: times the own; supply_loss: part; others: mm2")
 
     @model_validator(mode="after")
     def _makes_sense(self) -> FaultConfig:
-        sized = ("chamber_bias", "angle_bias", "rate_bias", "noise", "supply_loss", "hose_burst", "charge_leak")
         if not self.on_s < self.off_s:
             raise ValueError(f"on_s must be before off_s, got {self.on_s} and {self.off_s}")
-        if (self.kind in sized) != (self.size != 0.0):
-            raise ValueError(f"kind '{self.kind}' {'needs a' if self.kind in sized else 'has no'} size")
-        if (self.kind in ("noise", "supply_loss", "hose_burst", "charge_leak") and self.size < 0) or (
-            self.kind == "supply_loss" and self.size > 1
-        ):
-            raise ValueError(f"size of '{self.kind}' is out of range, got {self.size}")
+        if (self.kind in FAULT_SIZES) != (self.size != 0.0):
+            raise ValueError(f"kind '{self.kind}' {'needs a' if self.kind in FAULT_SIZES else 'has no'} size")
+        least, most = FAULT_SIZES.get(self.kind, (0, 0))
+        if not least <= self.size <= most:
+            raise ValueError(f"size of '{self.kind}' is out of range, which is {least} to {most}, got {self.size:g}")
         return self
 
 

@@ -25,18 +25,32 @@ class ProcessTable(Table):
 
 
 T = TypeVar("T", bound=BaseModel)
+MAX_DEPTH = 50
 
 
 def read_toml(path: Path) -> dict[str, Any]:
     """The content of a TOML file. Raises BadFile with one line that says what is wrong and where."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return _shallow(tomllib.loads(path.read_text(encoding="utf-8")))
     except OSError as error:
         raise BadFile(f"{path}: cannot be read: {error.strerror or error}") from None
     except UnicodeDecodeError as error:
         raise BadFile(f"{path}: not UTF-8 text (byte {error.start})") from None
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # TOMLDecodeError is one, and so is a number of more digits than Python reads
         raise BadFile(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise BadFile(f"{path}: not read: its tables or lists stand too deep in each other") from None
+
+
+def _shallow(content: dict[str, Any]) -> dict[str, Any]:
+    """The content as it is. Raises RecursionError where what reads it on would run out of stack."""
+    level: list[Any] = [content]
+    for _ in range(MAX_DEPTH):
+        tables = [value.values() if isinstance(value, dict) else value for value in level if isinstance(value, dict | list)]
+        level = [inner for values in tables for inner in values]
+    if level:
+        raise RecursionError
+    return content
 
 
 def load_model(model: type[T], content: dict[str, Any], path: Path | str) -> T:
@@ -44,7 +58,7 @@ def load_model(model: type[T], content: dict[str, Any], path: Path | str) -> T:
     try:
         return validated(model, content)
     except ValidationError as error:
-        raise BadConfig(f"{path}: {'; '.join(_say(model, e) for e in error.errors()[:3])}") from None
+        raise BadConfig(f"{path}: {'; '.join(_say(model, e) for e in _own_errors(error)[:3])}") from None
 
 
 def validated(model: type[T], content: dict[str, Any]) -> T:
@@ -53,6 +67,17 @@ def validated(model: type[T], content: dict[str, Any]) -> T:
     By way of JSON, whose strict mode takes an array for a tuple and a whole number for a float, as TOML means them.
     """
     return model.model_validate_json(json.dumps(content, default=str), strict=True)
+
+
+def _own_errors(error: ValidationError) -> list[Any]:
+    """The errors without those that only follow: a list whose entries are refused has too few of them."""
+    errors: list[Any] = error.errors()
+    refused = [e["loc"] for e in errors]
+    return [e for e in errors if e["type"] != "too_short" or not any(_within(loc, e["loc"]) for loc in refused)]
+
+
+def _within(inner: tuple[Any, ...], outer: tuple[Any, ...]) -> bool:
+    return len(inner) > len(outer) and inner[: len(outer)] == outer
 
 
 def _say(model: type[BaseModel], error: Any) -> str:

@@ -11,17 +11,31 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from softloop.wire.benchfile import Table
+from softloop.wire.channels import COMMAND, INCLINATION, PRESSURE, VALVES
+from softloop.wire.messages import message
 
 ALWAYS_S = 1e9
+LATEST_S = 1e8  # three years; in nanoseconds it fits into 64 bits with all that is added to it
 LINE_ACTIONS = ("drop", "delay", "duplicate", "reorder", "corrupt")
 # Kinds whose size means something, and what. All others have none; `corrupt` may have one.
 SIZED = {"delay": "ms", "step": "ms", "bias": "kPa, deg or deg/s", "noise": "its standard deviation"}
+# Action, or target of a sensor's, -> the largest size and what that is: beyond it nothing more goes wrong, so it is a typo.
+SIZES_MOST: dict[str, tuple[int, str]] = {
+    "delay": (60_000, "ms, a minute: what is later than that is lost"),
+    "step": (3_600_000, "ms, an hour: what a wrong time of summer steps by"),
+    "chamber_pressure": (1_000, "kPa: far above any supply"),
+    "supply_pressure": (1_000, "kPa: far above any supply"),
+    "angle": (360, "deg: from any angle to any other"),
+    "rate": (1_000, "deg/s: far above what an actuator turns with"),
+}
+CAN_BITS, BYTE_BITS = 64, 8
 # Target -> the process that injects. A bus in time is the plant's.
 CAN_TARGETS = {"analog": "pressures", "driver": "valves", "command": "valves"}
 BABBLE_TARGETS = ("first", "last")  # in arbitration
 BUS_TARGETS = dict.fromkeys((*CAN_TARGETS, *BABBLE_TARGETS), "plant")
 SERIAL_TARGETS = {"inclinometer": "inclinometer"}
 ZENOH_TARGETS = {"pressure": "pressures", "inclination": "inclinometer", "command": "controller", "valves": "valves"}
+ZENOH_BITS = {c.name: 8 * message(c.message).cdr_size for c in (PRESSURE, INCLINATION, COMMAND, VALVES)}
 SENSOR_TARGETS = {
     "chamber_pressure": "pressures", "supply_pressure": "pressures", "angle": "inclinometer", "rate": "inclinometer",
 }  # fmt: skip
@@ -54,8 +68,8 @@ class InjectionFields(Table):
 
     kind: str = Field(description="what goes wrong; docs/faults.md lists the kinds")
     target: str = Field("", description="where: a wire, a channel, a sensor's value or a process, as docs/faults.md lists them")
-    at_s: float = Field(ge=0, description="when it begins")
-    duration_s: float = Field(ALWAYS_S, gt=0, description="default: it stays")
+    at_s: float = Field(ge=0, le=LATEST_S, description="when it begins")
+    duration_s: float = Field(ALWAYS_S, gt=0, le=ALWAYS_S, description="default: it stays")
     probability: float = Field(1.0, gt=0, le=1, description="how likely each frame, byte, sample or value is hit")
     size: float = Field(0.0, description="delay, step: ms; bias: kPa, deg, deg/s; noise: its deviation; corrupt: bits, 0 is one")
 
@@ -101,14 +115,29 @@ class InjectionConfig(InjectionFields):
             raise ValueError(f"kind '{self.kind}' has no target '{self.target}'; it has: {names}")
         if self.target == "command" and self.action in ("error_frames", "bus_off"):
             raise ValueError(f"kind '{self.kind}' has no target 'command'; a node's trouble is that of target 'driver'")
+        self._check_size()
+        if self.probability != 1.0 and not self.has_chance:
+            raise ValueError(f"kind '{self.kind}' has no probability")
+        return self
+
+    def _check_size(self) -> None:
         if (self.action in SIZED) != (self.size != 0.0) and self.action != "corrupt":
             needs = f"needs a size ({SIZED[self.action]})" if self.action in SIZED else "has no size"
             raise ValueError(f"kind '{self.kind}' {needs}")
         if self.size < 0 and self.action not in ("bias", "step"):
             raise ValueError(f"size of '{self.kind}' must be above 0, got {self.size:g}")
-        if self.probability != 1.0 and not self.has_chance:
-            raise ValueError(f"kind '{self.kind}' has no probability")
-        return self
+        if self.action == "corrupt" and not self.size.is_integer():
+            raise ValueError(f"size of '{self.kind}' must be a whole number of bits, got {self.size:g}")
+        most, what = self._most() if self.size else (0, "")
+        if abs(self.size) > most:
+            raise ValueError(f"size of '{self.kind}' must be at most {most} ({what}), got {self.size:g}")
+
+    def _most(self) -> tuple[int, str]:
+        """The largest size of a kind that has one, either way, and what that is."""
+        if self.action == "corrupt":
+            whole = {"can": (CAN_BITS, "bits: a whole CAN frame"), "serial": (BYTE_BITS, "bits: a whole byte")}
+            return whole.get(self.family) or (ZENOH_BITS[self.target], "bits: a whole message")
+        return SIZES_MOST[self.target if self.family == "sensor" else self.action]
 
 
 class FaultsConfig(Table):

@@ -68,11 +68,11 @@ def write(folder, text, name="bench.toml"):
         ),
         (
             ("[can.can0]", '[[faults.injections]]\nkind = "bus_disturb"\ntarget = "driver"\nat_s = 1.0\n[can.can0]'),
-            "key 'faults.injections': kind 'bus_disturb' needs a [can.NAME.emulation]",
+            "key 'faults.injections.0': kind 'bus_disturb' needs a [can.NAME.emulation]",
         ),
         (
             ("[can.can0]", '[[faults.injections]]\nkind = "router_loss"\nat_s = 1.0\n[can.can0]'),
-            "kind 'router_loss' needs [run] shared_router = true",
+            "key 'faults.injections.0': kind 'router_loss' needs [run] shared_router = true",
         ),
         (
             (

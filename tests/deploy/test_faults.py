@@ -6,8 +6,11 @@ from pathlib import Path
 import pytest
 
 from softloop.deploy import faults
-from softloop.deploy.faults import Result, run_all
-from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadFile, Unavailable
+from softloop.deploy.bench import find_bench
+from softloop.deploy.faults import Result, run_all, run_with_faults
+from softloop.deploy.launcher import Options
+from softloop.deploy.scenario import shipped_scenarios
+from softloop.wire.errors import EXIT_NEGATIVE, EXIT_OK, BadConfig, BadFile, Unavailable
 
 
 def result(name, expected, seen, **more):
@@ -58,6 +61,26 @@ def test_a_folder_that_cannot_be_is_one_line(seen, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(Unavailable, match="cannot be written"):
         run_all([Path("valves_killed")], tmp_path / "file", as_json=False)
+
+
+def test_a_mistake_in_the_last_scenario_is_found_before_any_runs(seen, tmp_path):
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(shipped_scenarios()["valves_killed"].read_text().replace("at_s = 2.0", "at_s = 50"))
+    with pytest.raises(BadConfig, match=r"wrong\.toml: key 'injections\.0\.at_s': the run is over by then: armed for 4 s"):
+        run_all([Path("valves_killed"), wrong], tmp_path / "out", as_json=False)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    (Options(duration_s=0.1, pace="wall"), "key 'injections.0.at_s': the run is over by then: armed for 0.1 s"),
+    (Options(pace="lockstep"), "key 'injections.0': kind 'process_kill' needs wall pace"),
+])  # fmt: skip
+def test_what_the_command_line_makes_impossible_is_said_of_the_scenario(tmp_path, options, said):
+    file = tmp_path / "mine.toml"
+    file.write_text(shipped_scenarios()["valves_killed"].read_text().replace("at_s = 2.0", "at_s = 9"))
+    with pytest.raises(BadConfig) as caught:
+        run_with_faults(find_bench(Path("sim")), file, options)
+    assert str(caught.value).startswith(f"{file}: {said}")
 
 
 def test_an_unknown_scenario_is_found_before_any_runs(seen, tmp_path):

@@ -123,7 +123,10 @@ def test_a_stuck_valve_stays_where_it_is(layer):
 @pytest.mark.parametrize("fault", [
     {"kind": "noise", "on_s": 1.0}, {"kind": "analog_silent", "on_s": 1.0, "size": 1.0}, {"kind": "magic", "on_s": 1.0},
     {"kind": "supply_loss", "on_s": 1.0, "size": 1.5}, {"kind": "hose_burst", "on_s": 1.0, "size": -1.0},
-    {"kind": "angle_stuck", "on_s": 2.0, "off_s": 1.0},
+    {"kind": "angle_stuck", "on_s": 2.0, "off_s": 1.0}, {"kind": "hose_burst", "on_s": 1.0, "size": 100.1},
+    {"kind": "charge_leak", "on_s": 1.0, "size": 1e18}, {"kind": "chamber_bias", "on_s": 1.0, "size": -1e18},
+    {"kind": "angle_bias", "on_s": 1.0, "size": 361.0}, {"kind": "rate_bias", "on_s": 1.0, "size": 1e4},
+    {"kind": "noise", "on_s": 1.0, "size": 1e4}, {"kind": "angle_stuck", "on_s": 1e10, "off_s": 1e11},
 ])  # fmt: skip
 def test_a_fault_that_makes_no_sense_is_refused(fault):
     with pytest.raises(ValidationError):

@@ -42,6 +42,20 @@ def test_wrong_type_range_and_missing_key_are_named():
     assert "key 'inner'" in fault({"name": "x", "inner": 3})
 
 
+class Listed(Table):
+    inners: tuple[Inner, ...] = Field(min_length=2)
+
+
+def test_a_list_with_a_wrong_entry_is_not_too_short_besides():
+    for content, said in (
+        ([{"depth": 10}, {"depth": 1}], "b.toml: key 'inners.0.depth': Input should be less than or equal to 9 (got 10)"),
+        ([{"depth": 1}], "b.toml: key 'inners': Tuple should have at least 2 items after validation, not 1 (got [{'depth': 1}])"),
+    ):
+        with pytest.raises(BadConfig) as caught:
+            load_model(Listed, {"inners": content}, "b.toml")
+        assert str(caught.value) == said
+
+
 def test_files_that_are_missing_or_not_toml_are_one_line(tmp_path):
     with pytest.raises(BadFile, match="cannot be read"):
         read_toml(tmp_path / "none.toml")
@@ -51,6 +65,25 @@ def test_files_that_are_missing_or_not_toml_are_one_line(tmp_path):
     (tmp_path / "latin.toml").write_bytes(b"name = '\xe9'")
     with pytest.raises(BadFile, match="not UTF-8"):
         read_toml(tmp_path / "latin.toml")
+
+
+DEEP = [f"a = {'[' * 100_000}", f"{'a.' * 50_000}b = 1", f"{'a.' * 50}b = 1", f"a = {'[' * 60}{']' * 60}"]
+
+
+@pytest.mark.parametrize("text", [f"a = {'1' * 5000}", *DEEP])
+def test_what_no_reader_takes_is_one_line(tmp_path, text):
+    (tmp_path / "b.toml").write_text(text)
+    with pytest.raises(
+        BadFile, match="too deep in each other" if text in DEEP else "not valid TOML: Exceeds the limit"
+    ) as caught:
+        read_toml(tmp_path / "b.toml")
+    assert str(caught.value).startswith(f"{tmp_path}/b.toml: ")
+    assert len(str(caught.value)) < 300
+
+
+def test_tables_that_stand_less_deep_are_read(tmp_path):
+    (tmp_path / "b.toml").write_text(f"{'a.' * 40}b = [[1]]")
+    assert read_toml(tmp_path / "b.toml")["a"]["a"]["a"]
 
 
 @given(st.binary(max_size=200))

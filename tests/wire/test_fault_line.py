@@ -7,8 +7,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from softloop.wire.fault_config import CAN_TARGETS, FaultsConfig, InjectionConfig
+from softloop.wire.can_frame import MAX_DLC
+from softloop.wire.fault_config import (
+    CAN_TARGETS,
+    SENSOR_TARGETS,
+    SIZES_MOST,
+    ZENOH_BITS,
+    ZENOH_TARGETS,
+    FaultsConfig,
+    InjectionConfig,
+)
 from softloop.wire.fault_line import Line, Strike, flip_bits
+from softloop.wire.messages import message
 
 S = 1_000_000_000
 MS = 1_000_000
@@ -111,6 +121,35 @@ def test_no_byte_no_bit():
 def test_an_injection_that_makes_no_sense_is_refused(injection):
     with pytest.raises(ValidationError):
         InjectionConfig.model_validate({"at_s": 1.0, **injection})
+
+
+@pytest.mark.parametrize(("kind", "target", "most"), [
+    ("can_corrupt", "analog", 8 * MAX_DLC), ("can_corrupt", "command", 8 * MAX_DLC), ("serial_corrupt", "inclinometer", 8),
+    ("zenoh_corrupt", "pressure", 8 * message("PressureSample").cdr_size),
+    ("zenoh_corrupt", "command", 8 * message("ValveCommand").cdr_size),
+    ("can_delay", "analog", 60_000), ("serial_delay", "inclinometer", 60_000), ("zenoh_delay", "valves", 60_000),
+    ("clock_step", "controller", 3_600_000), ("clock_step", "controller", -3_600_000),
+    ("sensor_bias", "chamber_pressure", 1000), ("sensor_bias", "angle", -360), ("sensor_noise", "rate", 1000),
+])  # fmt: skip
+def test_a_size_beyond_which_nothing_more_goes_wrong_is_a_typo(kind, target, most):
+    injection = {"kind": kind, "target": target, "at_s": 1.0}
+    assert InjectionConfig.model_validate({**injection, "size": most}).size == most
+    for beyond in (most + (1 if most > 0 else -1), 1e18 if most > 0 else -1e18):
+        with pytest.raises(ValidationError, match=rf"size of '{kind}' must be at most {abs(most)} \(.*\), got "):
+            InjectionConfig.model_validate({**injection, "size": beyond})
+
+
+@pytest.mark.parametrize("kind", ["can_corrupt", "serial_corrupt", "zenoh_corrupt"])
+def test_half_a_bit_cannot_be_flipped(kind):
+    target = {"can_corrupt": "driver", "serial_corrupt": "inclinometer", "zenoh_corrupt": "command"}[kind]
+    assert InjectionConfig(kind=kind, target=target, at_s=0.0, size=3.0).size == 3.0
+    with pytest.raises(ValidationError, match=f"size of '{kind}' must be a whole number of bits, got 2.5"):
+        InjectionConfig(kind=kind, target=target, at_s=0.0, size=2.5)
+
+
+def test_every_channel_and_sensor_has_its_largest_size():
+    assert set(ZENOH_TARGETS) == set(ZENOH_BITS)
+    assert set(SENSOR_TARGETS) < set(SIZES_MOST)
 
 
 def test_each_process_is_given_its_own_with_their_places():
